@@ -1,0 +1,94 @@
+//! The command line: one file per subcommand.
+
+pub mod bench;
+pub mod demo;
+pub mod eval;
+pub mod extract;
+pub mod head;
+pub mod healthcheck;
+pub mod import;
+pub mod load;
+pub mod map;
+pub mod match_images;
+pub mod model;
+pub mod openapi;
+pub mod query;
+pub mod serve;
+pub mod synth;
+pub mod train;
+pub mod verify;
+
+use clap::{Parser, Subcommand};
+
+/// Visual place recognition: which mapped place does this photo show?
+#[derive(Debug, Parser)]
+#[command(name = "placeformer", version, arg_required_else_help = true)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// The subcommands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Run the service.
+    Serve(serve::ServeArgs),
+    /// Import a folder of photos into a map.
+    Import(import::ImportArgs),
+    /// Ask which place a photo shows.
+    Query(query::QueryArgs),
+    /// Match two images and draw the evidence.
+    Match(match_images::MatchArgs),
+    /// Show every intermediate of extraction.
+    Extract(extract::ExtractArgs),
+    /// Obtain and inspect models.
+    Model(model::ModelArgs),
+    /// Fit or train the projection to the global descriptor.
+    Head(head::HeadArgs),
+    /// Measure recall on a data set.
+    Eval(eval::EvalArgs),
+    /// Train the model.
+    Train(train::TrainArgs),
+    /// Render synthetic street scenes.
+    Synth(synth::SynthArgs),
+    /// Serve a demo map, query it, write a report.
+    Demo(demo::DemoArgs),
+    /// Measure every stage beside its baselines.
+    Bench(bench::BenchArgs),
+    /// Drive a server at a constant rate.
+    Load(load::LoadArgs),
+    /// Check every record of a store.
+    Verify(verify::VerifyArgs),
+    /// Ask a running server whether it is ready.
+    Healthcheck(healthcheck::HealthcheckArgs),
+    /// Print the OpenAPI document.
+    Openapi(openapi::OpenapiArgs),
+    /// Inspect and change maps.
+    Map(map::MapArgs),
+}
+
+impl Cli {
+    /// Runs the subcommand to its end.
+    pub fn run(self) -> anyhow::Result<()> {
+        match self.command {
+            Command::Serve(args) => serve::run(args),
+            Command::Import(args) => import::run(args),
+            Command::Query(args) => query::run(args),
+            Command::Match(args) => match_images::run(args),
+            Command::Extract(args) => extract::run(args),
+            Command::Model(args) => model::run(args),
+            Command::Head(args) => head::run(args),
+            Command::Eval(args) => eval::run(args),
+            Command::Train(args) => train::run(args),
+            Command::Synth(args) => synth::run(args),
+            Command::Demo(args) => demo::run(args),
+            Command::Bench(args) => bench::run(args),
+            Command::Load(args) => load::run(args),
+            Command::Verify(args) => verify::run(args),
+            Command::Healthcheck(args) => healthcheck::run(args),
+            Command::Openapi(args) => openapi::run(args),
+            Command::Map(args) => map::run(args),
+        }
+    }
+}

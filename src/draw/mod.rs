@@ -1,0 +1,1 @@
+//! Pictures of matches: both images, attention, key patches, inlier lines.

@@ -1,0 +1,1 @@
+//! Recall on data sets: readers, measures, reports.

@@ -1,0 +1,1 @@
+//! The only code that composes the stages; knows nothing of the web.

@@ -1,0 +1,1 @@
+//! Learning the head and the backbone (paper III-F).
