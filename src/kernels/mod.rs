@@ -1,1 +1,56 @@
 //! SIMD inner loops with scalar twins. The only `unsafe` code of the crate.
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`simd`] | which instructions may be used: chosen once at start, or forced by `PLACEFORMER_SIMD` |
+//!
+//! Every kernel takes a [`Simd`] and has a portable twin, which tests compare it with over odd sizes. Where tests ran
+//! on a CPU without AVX-512, that level is still guarded: [`self_check`] compares every kernel with its twin on the
+//! machine at hand before the program computes anything, and a level that disagrees is refused with an error.
+
+pub mod simd;
+
+pub use simd::{Simd, SimdError, SimdLevel};
+
+/// Compares one kernel at one level with its scalar twin on small odd inputs; tells the first difference.
+type Check = fn(Simd) -> Result<(), String>;
+
+/// Every kernel's check, by the kernel's name.
+const CHECKS: &[(&str, Check)] = &[];
+
+/// Chooses the level and compares every kernel at it with its scalar twin (a few milliseconds). Programs call this
+/// once at start.
+///
+/// # Errors
+/// `PLACEFORMER_SIMD` names no level or one this CPU lacks; or a kernel disagrees with its twin.
+pub fn self_check() -> Result<Simd, SimdError> {
+    let simd = simd::try_selected()?;
+    check_level(simd, CHECKS)?;
+    Ok(simd)
+}
+
+fn check_level(simd: Simd, checks: &[(&'static str, Check)]) -> Result<(), SimdError> {
+    for &(kernel, check) in checks {
+        check(simd).map_err(|difference| SimdError::Disagrees { kernel, level: simd.level(), difference })?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_level_of_this_cpu_agrees_with_the_scalar_twins() {
+        for simd in Simd::all() {
+            check_level(simd, CHECKS).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_kernel_that_disagrees_is_refused_by_name() {
+        let wrong: &[(&str, Check)] = &[("fine", |_| Ok(())), ("broken", |_| Err("3 is not 4".into()))];
+        let error = check_level(Simd::SCALAR, wrong).unwrap_err().to_string();
+        assert!(error.contains("broken") && error.contains("3 is not 4"), "{error}");
+    }
+}
