@@ -1,0 +1,113 @@
+//! Nordland: one railway filmed in four seasons, aligned frame by frame; positives lie within some frames.
+//!
+//! Two layouts: the downloader's (`images/test/{database,queries}`, the frame in the seventh field of an
+//! `@utm_east@utm_north@...` name) and the films' own folders (`summer/` and `winter/`, the frame at the end of the
+//! name, such as `images-00042.png`).
+
+use super::files::{list_images, require};
+use super::utm_name::UtmName;
+use super::{Dataset, DatasetOptions, Item, Skipped, Split, Truth};
+use crate::eval::EvalError;
+use std::path::{Path, PathBuf};
+
+const NAME: &str = "nordland";
+const EXPECTED: &str = "images/test/{database,queries}, or summer/ (database) and winter/ (queries)";
+
+/// Reads both sides and matches them by frame.
+pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, EvalError> {
+    let (database_dir, queries_dir) = folders(root, options.split.unwrap_or(Split::Test))?;
+    let mut skipped = Vec::new();
+    let mut read = |folder: &Path| -> Result<(Vec<Item>, Vec<u64>), EvalError> {
+        let (mut items, mut frames) = (Vec::new(), Vec::new());
+        for (name, path) in list_images(folder)? {
+            match frame_of(&name) {
+                Some(frame) => {
+                    items.push(Item::new(name, path));
+                    frames.push(frame);
+                }
+                None => skipped.push(Skipped { name, reason: "the name has no frame number".into() }),
+            }
+        }
+        Ok((items, frames))
+    };
+    let (database, database_frames) = read(&database_dir)?;
+    let (queries, query_frames) = read(&queries_dir)?;
+    let mut by_frame: Vec<(u64, usize)> = database_frames.iter().enumerate().map(|(i, &frame)| (frame, i)).collect();
+    by_frame.sort_unstable();
+    let truth = query_frames.iter().map(|&frame| truth_of(frame, options.frame_tolerance, &by_frame)).collect();
+    let notes = vec![format!("positives lie within {} frames", options.frame_tolerance)];
+    Ok(Dataset { name: NAME.into(), database, queries, truth, skipped, notes })
+}
+
+fn folders(root: &Path, split: Split) -> Result<(PathBuf, PathBuf), EvalError> {
+    let films = (root.join("summer"), root.join("winter"));
+    if films.0.exists() && films.1.exists() {
+        return Ok(films);
+    }
+    let folder = require(NAME, root.join("images").join(split.as_str()), EXPECTED)?;
+    Ok((require(NAME, folder.join("database"), EXPECTED)?, require(NAME, folder.join("queries"), EXPECTED)?))
+}
+
+fn frame_of(name: &str) -> Option<u64> {
+    if let Ok(parsed) = UtmName::parse(name) {
+        return parsed.pano_id.parse().ok();
+    }
+    let file = name.rsplit('/').next()?;
+    let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);
+    let digits = stem.len() - stem.bytes().rev().take_while(u8::is_ascii_digit).count();
+    stem[digits..].parse().ok()
+}
+
+fn truth_of(frame: u64, tolerance: u64, by_frame: &[(u64, usize)]) -> Truth {
+    let start = by_frame.partition_point(|&(other, _)| other < frame.saturating_sub(tolerance));
+    let within = by_frame[start..].iter().take_while(|&&(other, _)| other <= frame.saturating_add(tolerance));
+    Truth::from_positives(within.map(|&(_, index)| index).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{DatasetKind, load as load_dataset};
+    use super::*;
+
+    fn write(root: &Path, names: &[String]) {
+        for name in names {
+            let path = root.join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, b"x").unwrap();
+        }
+    }
+
+    #[test]
+    fn downloader_names_match_by_frame_not_by_text_order() {
+        let root = tempfile::tempdir().unwrap();
+        // Sorted as text, frame 100 comes before frame 20.
+        let database =
+            [0, 9, 20, 31, 100].map(|f| format!("images/test/database/@0@{:.1}@@@@@{f}@@@@@@@@.jpg", f as f64 * 2.4));
+        let queries = [10, 50].map(|f| format!("images/test/queries/@0@{:.1}@@@@@{f}@@@@@@@@.jpg", f as f64 * 2.4));
+        write(root.path(), &database);
+        write(root.path(), &queries);
+        write(root.path(), &["images/test/queries/@0@1@@@@@@@@@@@@@@.jpg".to_owned()]);
+        let dataset = load_dataset(DatasetKind::Nordland, root.path(), &DatasetOptions::default()).unwrap();
+        let frames: Vec<_> = dataset.database.iter().map(|item| frame_of(&item.name).unwrap()).collect();
+        let positives = |frame| {
+            let query = dataset.queries.iter().position(|query| frame_of(&query.name) == Some(frame)).unwrap();
+            let mut found: Vec<u64> = dataset.truth[query].positives().iter().map(|&i| frames[i]).collect();
+            found.sort_unstable();
+            found
+        };
+        assert_eq!((positives(10), positives(50)), (vec![0, 9, 20], vec![]));
+        assert_eq!((dataset.queries.len(), dataset.skipped.len()), (2, 1));
+    }
+
+    #[test]
+    fn film_folders_match_by_the_number_at_the_end() {
+        let root = tempfile::tempdir().unwrap();
+        let film = |season: &str| (0..30).map(|i| format!("{season}/images-{i:05}.png")).collect::<Vec<_>>();
+        write(root.path(), &film("summer"));
+        write(root.path(), &film("winter"));
+        let options = DatasetOptions { frame_tolerance: 1, ..Default::default() };
+        let dataset = load_dataset(DatasetKind::Nordland, root.path(), &options).unwrap();
+        assert_eq!(dataset.truth[0], Truth::Positives(vec![0, 1]));
+        assert_eq!(dataset.truth[17], Truth::Positives(vec![16, 17, 18]));
+    }
+}
