@@ -1,46 +1,41 @@
 //! A normalised image to its descriptor: transformer, global descriptor, fusion, selection (paper III-A to III-C).
+//!
+//! ```text
+//! ImageTensor --encoder--> tokens [n, d], CLS attention [heads, n]
+//!     tokens    --global--> pooled [d] --head--> global [256]
+//!     attention --fusion--> per scale --selection--> key patches, fused from tokens
+//! ```
+//!
+//! [`Extractor`] puts it together from [`ExtractConfig`], a weights file and a [`Head`]; [`pull`] obtains the weights.
+//! [`Encoder`] is the seam at which a faster transformer can stand in for the candle one.
 
-use crate::error::ErrorCode;
-use crate::types::{Descriptor, ImageSize, ImageTensor, ModelId};
-use std::path::Path;
+mod activation;
+mod config;
+mod encoder;
+mod error;
+mod extractor;
+mod fusion;
+mod global;
+mod head;
+mod positions;
+mod preset;
+mod record;
+mod selection;
+mod trace;
+mod vit;
+mod weights;
 
-/// Settings of extraction.
-#[derive(Debug, Clone, PartialEq, Default, serde::Serialize, serde::Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ExtractConfig {}
-
-/// Why extraction, or loading what it needs, failed.
-#[derive(Debug, thiserror::Error)]
-pub enum ExtractError {}
-
-impl ExtractError {
-    /// The row of the error table.
-    pub fn code(&self) -> ErrorCode {
-        match *self {}
-    }
-}
-
-/// A loaded model with its head.
-pub struct Extractor {}
-
-impl Extractor {
-    /// Loads weights and head; refuses files that do not fit by name, shape or hash.
-    pub fn load(_config: &ExtractConfig, _weights: &Path, _head: Option<&Path>) -> Result<Self, ExtractError> {
-        unimplemented!()
-    }
-
-    /// What its descriptors may be compared with.
-    pub fn model_id(&self) -> &ModelId {
-        unimplemented!()
-    }
-
-    /// The size images must be resized to.
-    pub fn input_size(&self) -> ImageSize {
-        unimplemented!()
-    }
-
-    /// One descriptor per image; a batch gives bit for bit what single images give.
-    pub fn extract(&self, _images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
-        unimplemented!()
-    }
-}
+pub use config::{ExtractConfig, HeadChoice};
+pub use encoder::{EncodedImage, Encoder, EncoderSpec, Precision, TokenGrid, check_image, token_grid};
+pub use error::ExtractError;
+pub use extractor::{Extractor, build_encoder};
+pub use fusion::{attention_map, average_pool};
+pub use global::{l2_normalise, mean_token};
+pub use head::Head;
+pub use positions::interpolate as interpolate_positions;
+pub use preset::{Geometry, LAYER_NORM_EPS, Preset};
+pub use record::Record;
+pub use selection::{key_patches, select};
+pub use trace::{ExtractionTrace, TraceArray, TraceValues};
+pub use vit::CandleEncoder;
+pub use weights::{BlockWeights, Linear, Norm, VitWeights};

@@ -1,0 +1,256 @@
+//! Weights, head and settings put together: from normalised images to descriptors.
+
+use super::config::{ExtractConfig, HeadChoice};
+use super::encoder::{EncodedImage, Encoder, EncoderSpec, Precision, check_image, token_grid};
+use super::error::ExtractError;
+use super::global::{l2_normalise, mean_token};
+use super::head::Head;
+use super::preset::Geometry;
+use super::trace::ExtractionTrace;
+use super::vit::CandleEncoder;
+use super::weights::VitWeights;
+use super::{fusion, positions, record, selection};
+use crate::types::{
+    Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid, PoolingStride,
+};
+use std::path::Path;
+
+/// A loaded model with its head.
+pub struct Extractor {
+    config: ExtractConfig,
+    geometry: Geometry,
+    encoder: Box<dyn Encoder>,
+    /// `None` only where the settings say `head = "none"`.
+    head: Option<Head>,
+    /// Interpolated positions, kept for traces.
+    positions: Vec<f32>,
+    parameters: usize,
+    backbone: String,
+    model_id: ModelId,
+}
+
+impl Extractor {
+    /// Loads weights and head; refuses files that do not fit by name, shape or hash. `head` overrides the settings'.
+    ///
+    /// Reads and hashes some hundred megabytes: call it off the async threads.
+    pub fn load(config: &ExtractConfig, weights: &Path, head: Option<&Path>) -> Result<Self, ExtractError> {
+        config.encoder_spec()?;
+        record::verify(weights)?;
+        let weights = VitWeights::load(weights, config.preset, config.heads)?;
+        let choice = head.map_or_else(|| config.head.clone(), |path| HeadChoice::File(path.to_owned()));
+        Self::from_weights(config, &weights, &choice)
+    }
+
+    /// As [`Extractor::load`], from weights in memory.
+    pub fn from_weights(config: &ExtractConfig, weights: &VitWeights, head: &HeadChoice) -> Result<Self, ExtractError> {
+        let spec = config.encoder_spec()?;
+        let geometry = weights.geometry;
+        let grid = token_grid(&geometry, &spec);
+        let backbone = backbone_id(config, &spec, weights);
+        let head = choose_head(head, &backbone, geometry.dim)?;
+        let model_id = compose_model_id(&backbone, config, &spec, head.as_ref());
+        let (from, to) = (weights.position_grid, (grid.rows, grid.columns));
+        Ok(Self {
+            config: config.effective()?,
+            geometry,
+            encoder: build_encoder(weights, &spec, config.precision)?,
+            head,
+            positions: positions::interpolate(&weights.positions, geometry.dim, from, to),
+            parameters: weights.parameters(),
+            backbone,
+            model_id,
+        })
+    }
+
+    /// What its descriptors may be compared with.
+    pub fn model_id(&self) -> &ModelId {
+        &self.model_id
+    }
+
+    /// The part of the [`ModelId`] a head is bound to: preset, weights, exit block and norm.
+    pub fn backbone(&self) -> &str {
+        &self.backbone
+    }
+
+    /// The settings in force, the preset's own values filled in.
+    pub fn config(&self) -> &ExtractConfig {
+        &self.config
+    }
+
+    /// The backbone's shape.
+    pub fn geometry(&self) -> &Geometry {
+        &self.geometry
+    }
+
+    /// The head in use.
+    pub fn head(&self) -> Option<&Head> {
+        self.head.as_ref()
+    }
+
+    /// Learned values of the whole backbone, including blocks that are not computed.
+    pub fn parameters(&self) -> usize {
+        self.parameters
+    }
+
+    /// The size images must be resized to.
+    pub fn input_size(&self) -> ImageSize {
+        self.encoder.spec().input_size
+    }
+
+    /// Length of the global descriptor: 256, or the backbone's width where there is no head.
+    pub fn global_dim(&self) -> usize {
+        if self.head.is_some() { GLOBAL_DIM } else { self.geometry.dim }
+    }
+
+    /// Length of a key patch's descriptor and of the pooled token.
+    pub fn dim(&self) -> usize {
+        self.geometry.dim
+    }
+
+    /// The encoder's implementation and precision, for reports.
+    pub fn encoder_name(&self) -> String {
+        self.encoder.name()
+    }
+
+    /// Bytes of weights held.
+    pub fn weight_bytes(&self) -> usize {
+        self.encoder.weight_bytes()
+    }
+
+    /// One descriptor per image; a batch gives bit for bit what single images give.
+    pub fn extract(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
+        let describe = |encoded: &EncodedImage| {
+            let pooled = self.pool(encoded)?;
+            let global = self.global(&pooled);
+            Ok(Descriptor { global, pooled, patches: PackedPatches::quantise(&self.key_patches(encoded)) })
+        };
+        self.encoder.encode(images)?.iter().map(describe).collect()
+    }
+
+    /// Key patches in full precision beside the descriptor, for measuring what quantisation costs.
+    pub fn extract_full(&self, images: &[ImageTensor]) -> Result<Vec<(Descriptor, KeyPatches)>, ExtractError> {
+        let describe = |encoded: &EncodedImage| {
+            let pooled = self.pool(encoded)?;
+            let (global, keys) = (self.global(&pooled), self.key_patches(encoded));
+            Ok((Descriptor { global, pooled, patches: PackedPatches::quantise(&keys) }, keys))
+        };
+        self.encoder.encode(images)?.iter().map(describe).collect()
+    }
+
+    /// The L2-normalised mean token of each image: all that fitting or training a head needs.
+    pub fn pooled(&self, images: &[ImageTensor]) -> Result<Vec<Vec<f32>>, ExtractError> {
+        self.encoder.encode(images)?.iter().map(|encoded| self.pool(encoded)).collect()
+    }
+
+    /// Tokens and attention of each image, as the transformer gives them.
+    pub fn encode(&self, images: &[ImageTensor]) -> Result<Vec<EncodedImage>, ExtractError> {
+        self.encoder.encode(images)
+    }
+
+    /// Every intermediate of one image.
+    pub fn trace(&self, image: &ImageTensor) -> Result<ExtractionTrace, ExtractError> {
+        check_image(image, self.encoder.spec())?;
+        let encoded = self.encoder.encode(std::slice::from_ref(image))?.remove(0);
+        let pooled = self.pool(&encoded)?;
+        Ok(ExtractionTrace {
+            spec: *self.encoder.spec(),
+            depth: self.geometry.depth,
+            image: image.clone(),
+            positions: self.positions.clone(),
+            attention: fusion::attention_map(&encoded.cls_attention, encoded.heads),
+            global: self.global(&pooled),
+            key_patches: self.key_patches(&encoded),
+            pooled,
+            encoded,
+        })
+    }
+
+    /// Runs one image through, so that the first request pays for no page fault and no thread start.
+    pub fn warm_up(&self) -> Result<(), ExtractError> {
+        let size = self.input_size();
+        let wave = |i: usize| ((i % 251) as f32 / 125.0 - 1.0) * ((i / 251 % 13) as f32 / 6.0);
+        let data = (0..3 * size.width as usize * size.height as usize).map(wave).collect();
+        self.extract(&[ImageTensor { size, data }]).map(drop)
+    }
+
+    fn pool(&self, encoded: &EncodedImage) -> Result<Vec<f32>, ExtractError> {
+        let mut pooled = mean_token(&encoded.tokens, encoded.dim);
+        if pooled.iter().chain(&encoded.cls_attention).any(|value| !value.is_finite()) {
+            return Err(ExtractError::NotFinite);
+        }
+        l2_normalise(&mut pooled);
+        Ok(pooled)
+    }
+
+    fn global(&self, pooled: &[f32]) -> Vec<f32> {
+        self.head.as_ref().map_or_else(|| pooled.to_vec(), |head| head.project(pooled))
+    }
+
+    fn key_patches(&self, encoded: &EncodedImage) -> KeyPatches {
+        let grid = PatchGrid {
+            columns: encoded.grid.columns as u16,
+            rows: encoded.grid.rows as u16,
+            patch_px: self.geometry.patch as u16,
+            stride: self.config.stride,
+        };
+        let (caps, tau) = (self.config.caps, self.config.tau);
+        selection::key_patches(&encoded.tokens, &encoded.cls_attention, encoded.heads, grid, caps, tau)
+    }
+}
+
+/// The encoder for `precision`.
+pub fn build_encoder(
+    weights: &VitWeights,
+    spec: &EncoderSpec,
+    precision: Precision,
+) -> Result<Box<dyn Encoder>, ExtractError> {
+    let unavailable = |precision| {
+        let reason = "only f32 is implemented".into();
+        Err(ExtractError::Precision { precision, reason })
+    };
+    match precision {
+        Precision::Auto | Precision::F32 => Ok(Box::new(CandleEncoder::new(weights, spec)?)),
+        Precision::Bf16 => unavailable("bf16"),
+        Precision::Int8 => unavailable("int8"),
+    }
+}
+
+/// Preset, weights, heads where they are not the preset's, exit block with an `n` for normed tokens:
+/// `dinov2-vits14:0f1e2d3c4b5a:b8`. A head depends on these and nothing else.
+fn backbone_id(config: &ExtractConfig, spec: &EncoderSpec, weights: &VitWeights) -> String {
+    let heads = match weights.geometry.heads {
+        heads if heads == config.preset.geometry().heads => String::new(),
+        heads => format!(":heads{heads}"),
+    };
+    let norm = if spec.token_norm { "n" } else { "" };
+    format!("{}:{}{heads}:b{}{norm}", config.preset, &weights.content_hash()[..12], spec.exit_block)
+}
+
+/// The backbone, then everything else a descriptor depends on. The precision is left out on purpose: descriptors of one
+/// model compare across precisions.
+fn compose_model_id(backbone: &str, config: &ExtractConfig, spec: &EncoderSpec, head: Option<&Head>) -> ModelId {
+    let attention = match spec.attention_block {
+        block if block == spec.exit_block => String::new(),
+        block => format!(":a{block}"),
+    };
+    let stride = if config.stride == PoolingStride::Kernel { "" } else { ":dense" };
+    let caps = config.caps.map(|cap| cap.to_string()).join("-");
+    let head = head.map_or("none".to_owned(), |head| head.content_hash()[..12].to_owned());
+    ModelId::new(format!("{backbone}:{}{attention}:t{}:k{caps}{stride}:h{head}", spec.input_size, config.tau))
+}
+
+fn choose_head(choice: &HeadChoice, backbone: &str, dim: usize) -> Result<Option<Head>, ExtractError> {
+    let (head, path) = match choice {
+        HeadChoice::None => return Ok(None),
+        HeadChoice::Default => match Head::built_in(backbone)? {
+            Some(head) => (head, None),
+            None => return Err(ExtractError::NoHead { backbone: backbone.to_owned() }),
+        },
+        HeadChoice::File(path) => (Head::load(path)?, Some(path.clone())),
+    };
+    if head.backbone() != backbone || head.dim() != dim {
+        let head_backbone = format!("{} ({}-d)", head.backbone(), head.dim());
+        return Err(ExtractError::HeadMismatch { path, head_backbone, backbone: format!("{backbone} ({dim}-d)") });
+    }
+    Ok(Some(head))
+}
