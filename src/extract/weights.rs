@@ -98,7 +98,7 @@ impl VitWeights {
         });
         let mut geometry = preset.geometry();
         geometry.heads = heads.or(recorded.transpose()?).unwrap_or(geometry.heads);
-        if geometry.heads == 0 || geometry.dim % geometry.heads != 0 {
+        if geometry.heads == 0 || !geometry.dim.is_multiple_of(geometry.heads) {
             return Err(bad(format!("{} heads do not divide tokens of width {}", geometry.heads, geometry.dim)));
         }
         let mut reader = Reader::new(&tensors)
