@@ -1,1 +1,42 @@
-//! Learning the head and the backbone (paper III-F).
+//! Learning the head and the backbone (paper III-F): the other half of the method.
+//!
+//! ```text
+//! data set --triplets--> positives within 10 m, the rest beyond 25 m
+//!    cycle: embed everything --mining--> hardest negatives of each query
+//!           N steps of triplets --loss--> --adam--> weights      (learning rate by schedule)
+//!           validation recall --> best weights kept, stop when it no longer improves
+//!           checkpoint (weights, moments, counters), log line
+//! ```
+//!
+//! A cycle depends only on the checkpoint it starts from and on the seed: every random choice is drawn from
+//! `(seed, step, position)`, and hard negatives are mined anew from the weights the cycle starts with. So a run that
+//! was interrupted continues from its last cycle bit for bit as if it had not been.
+//!
+//! | module | holds |
+//! |---|---|
+//! | `triplets` | which images are positives, which may be negatives |
+//! | `mining` | the negatives that look most like the query |
+//! | `loss`, `adam`, `schedule` | one step |
+//! | `head`, `backbone` | the two things that can be trained |
+//! | `augment` | photometric and geometric variation of training images |
+//! | `trainer`, `checkpoint`, `log` | the loop, its memory and its diary |
+
+mod adam;
+mod augment;
+mod checkpoint;
+mod error;
+mod head;
+mod log;
+mod loss;
+mod mining;
+mod schedule;
+mod trainer;
+mod triplets;
+
+pub use augment::{Augmentation, augment};
+pub use error::TrainError;
+pub use head::{HeadModel, PooledTokens};
+pub use log::{CycleRecord, read_log};
+pub use schedule::Schedule;
+pub use trainer::{Outcome, Session, TrainConfig, ValidationRecall};
+pub use triplets::{Side, TripletSet};

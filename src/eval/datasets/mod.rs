@@ -15,6 +15,7 @@ mod utm;
 mod utm_name;
 
 pub use files::{list_images, relative_name};
+pub use neighbours::NeighbourGrid;
 pub use pairs::load_pairs;
 pub use robotcar::Pose;
 pub use utm_name::{UtmName, UtmZone};

@@ -7,14 +7,14 @@ use super::{Item, MetricPoint, Truth};
 use std::collections::HashMap;
 
 /// A grid over the positions of one side of a data set.
-pub(super) struct NeighbourGrid {
+pub struct NeighbourGrid {
     radius_m: f64,
     cells: HashMap<(i64, i64), Vec<(usize, MetricPoint)>>,
 }
 
 impl NeighbourGrid {
     /// Hashes `points`, each with the index it is known by.
-    pub(super) fn new(radius_m: f64, points: impl IntoIterator<Item = (usize, MetricPoint)>) -> Self {
+    pub fn new(radius_m: f64, points: impl IntoIterator<Item = (usize, MetricPoint)>) -> Self {
         let mut cells: HashMap<_, Vec<_>> = HashMap::new();
         for (index, point) in points {
             cells.entry(cell(point, radius_m)).or_default().push((index, point));
@@ -23,7 +23,7 @@ impl NeighbourGrid {
     }
 
     /// The points at most the radius away, in no particular order.
-    pub(super) fn within(&self, centre: MetricPoint) -> impl Iterator<Item = usize> + '_ {
+    pub fn within(&self, centre: MetricPoint) -> impl Iterator<Item = usize> + '_ {
         let (column, row) = cell(centre, self.radius_m);
         let around = (-1..=1).flat_map(move |dx| (-1..=1).map(move |dy| (column + dx, row + dy)));
         around

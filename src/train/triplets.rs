@@ -1,0 +1,153 @@
+//! Which images show a query's place, and which may serve as its negatives (paper III-F: 10 m and 25 m).
+
+use super::TrainError;
+use crate::eval::datasets::{Dataset, MetricPoint, NeighbourGrid};
+use std::path::PathBuf;
+
+/// One side of a triplet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Side {
+    /// An image that asks.
+    Query,
+    /// An image that answers: positive or negative.
+    Database,
+}
+
+/// The images to learn from and their relations, computed once.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TripletSet {
+    /// Images that ask.
+    pub queries: Vec<PathBuf>,
+    /// Images that answer.
+    pub database: Vec<PathBuf>,
+    /// For each query, the database images that show its place, ascending.
+    pub positives: Vec<Vec<u32>>,
+    /// For each query, the database images too near to serve as negatives, ascending; includes the positives.
+    pub near: Vec<Vec<u32>>,
+}
+
+impl TripletSet {
+    /// Relations by position: positives within `positive_m` metres, negatives beyond `negative_m`.
+    ///
+    /// Images without a position are left out.
+    pub fn by_position(dataset: &Dataset, positive_m: f64, negative_m: f64) -> Result<Self, TrainError> {
+        if !(positive_m > 0.0 && positive_m <= negative_m && negative_m.is_finite()) {
+            return Err(TrainError::Setting(format!(
+                "positives within {positive_m} m and negatives beyond {negative_m} m leave no order between them"
+            )));
+        }
+        let located = |items: &[crate::eval::datasets::Item]| -> Vec<(PathBuf, MetricPoint)> {
+            items.iter().filter_map(|item| Some((item.path.clone(), item.position?))).collect()
+        };
+        let (queries, database) = (located(&dataset.queries), located(&dataset.database));
+        let grid = |radius| NeighbourGrid::new(radius, database.iter().map(|item| item.1).enumerate());
+        let (positive_grid, near_grid) = (grid(positive_m), grid(negative_m));
+        let within = |grid: &NeighbourGrid, point| {
+            let mut found: Vec<u32> = grid.within(point).map(|index| index as u32).collect();
+            found.sort_unstable();
+            found
+        };
+        Self {
+            positives: queries.iter().map(|item| within(&positive_grid, item.1)).collect(),
+            near: queries.iter().map(|item| within(&near_grid, item.1)).collect(),
+            queries: queries.into_iter().map(|item| item.0).collect(),
+            database: database.into_iter().map(|item| item.0).collect(),
+        }
+        .checked()
+    }
+
+    /// Relations by order, for drives whose frames carry no position: a frame's neighbours up to `positive_frames`
+    /// away show its place, frames of its drive more than `negative_frames` away or of another drive do not.
+    pub fn by_order(
+        drives: &[Vec<PathBuf>],
+        positive_frames: usize,
+        negative_frames: usize,
+    ) -> Result<Self, TrainError> {
+        if positive_frames == 0 || positive_frames > negative_frames {
+            return Err(TrainError::Setting(format!(
+                "positives within {positive_frames} frames and negatives beyond {negative_frames} leave no order between them"
+            )));
+        }
+        let images: Vec<PathBuf> = drives.iter().flatten().cloned().collect();
+        let (mut positives, mut near) = (Vec::new(), Vec::new());
+        let mut first = 0;
+        for drive in drives {
+            for frame in 0..drive.len() {
+                let around = |reach: usize| {
+                    let range = frame.saturating_sub(reach)..(frame + reach + 1).min(drive.len());
+                    range.map(move |other| (first + other) as u32)
+                };
+                // A frame is not its own positive, but it is too near to be a negative.
+                positives.push(around(positive_frames).filter(|&other| other as usize != first + frame).collect());
+                near.push(around(negative_frames).collect());
+            }
+            first += drive.len();
+        }
+        Self { queries: images.clone(), database: images, positives, near }.checked()
+    }
+
+    /// The queries that have a positive and at least one possible negative.
+    pub fn usable(&self) -> impl Iterator<Item = usize> + '_ {
+        (0..self.queries.len())
+            .filter(|&query| !self.positives[query].is_empty() && self.near[query].len() < self.database.len())
+    }
+
+    /// The images of one side.
+    pub fn images(&self, side: Side) -> &[PathBuf] {
+        match side {
+            Side::Query => &self.queries,
+            Side::Database => &self.database,
+        }
+    }
+
+    fn checked(self) -> Result<Self, TrainError> {
+        if self.usable().next().is_none() {
+            return Err(TrainError::NoTriplets(format!(
+                "of {} queries and {} database images, no query has both a positive and a negative",
+                self.queries.len(),
+                self.database.len()
+            )));
+        }
+        Ok(self)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::eval::datasets::{Item, Truth};
+
+    fn at(name: &str, east: f64) -> Item {
+        Item { position: Some(MetricPoint { east, north: 0.0 }), ..Item::new(name, name) }
+    }
+
+    fn dataset(database: Vec<Item>, queries: Vec<Item>) -> Dataset {
+        let truth = vec![Truth::Unknown; queries.len()];
+        Dataset { name: "line".into(), database, queries, truth, skipped: vec![], notes: vec![] }
+    }
+
+    #[test]
+    fn between_ten_and_twenty_five_metres_an_image_is_neither() {
+        let database = vec![at("d0", 0.0), at("d10", 10.0), at("d11", 11.0), at("d25", 25.0), at("d26", 26.0)];
+        let set = TripletSet::by_position(&dataset(database, vec![at("q", 0.0)]), 10.0, 25.0).unwrap();
+        assert_eq!(set.positives, [[0, 1]]);
+        assert_eq!(set.near, [[0, 1, 2, 3]]);
+    }
+
+    #[test]
+    fn images_without_a_position_are_left_out_and_nothing_to_learn_is_an_error() {
+        let database = vec![Item::new("lost", "lost"), at("far", 1000.0)];
+        let error = TripletSet::by_position(&dataset(database, vec![at("q", 0.0)]), 10.0, 25.0).unwrap_err();
+        assert!(matches!(error, TrainError::NoTriplets(_)), "{error}");
+    }
+
+    #[test]
+    fn frames_of_another_drive_are_negatives() {
+        let drive = |name: &str| (0..5).map(|i| PathBuf::from(format!("{name}/{i}"))).collect::<Vec<_>>();
+        let set = TripletSet::by_order(&[drive("a"), drive("b")], 1, 2).unwrap();
+        assert_eq!(set.positives[5], [6]);
+        assert_eq!(set.positives[2], [1, 3]);
+        assert_eq!(set.near[4], [2, 3, 4]);
+        assert_eq!(set.usable().count(), 10);
+    }
+}
