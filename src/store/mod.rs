@@ -1,17 +1,53 @@
 //! The truth on disk: references, their metadata and descriptors.
+//!
+//! A place, once acknowledged, must survive anything short of losing the disk; and a damaged disk must be noticed
+//! rather than believed. [`PlaceStore`] is what the rest of the crate sees; [`SqliteStore`] keeps it in one database
+//! with checksums on every row; `codec.rs` fixes the bytes of key patches; `crash_points.rs` lets tests kill the
+//! process between two writes.
 
-use crate::error::ErrorCode;
-use crate::types::{MapName, ModelId, NewReference, PackedPatches, Reference, ReferenceFields, ReferenceId};
+pub mod codec;
+pub mod crash_points;
+mod error;
+mod sqlite;
+
+pub use error::{EngineCause, StoreError};
+pub use sqlite::SqliteStore;
+
+use crate::types::{
+    ExternalId, MapName, ModelId, NewReference, PackedPatches, Reference, ReferenceFields, ReferenceId,
+};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
 use time::OffsetDateTime;
 
-/// Why the store could not do as asked.
-#[derive(Debug, thiserror::Error)]
-pub enum StoreError {}
+/// Settings of the embedded store.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct StoreConfig {
+    /// Most reading connections open at once; further readers wait.
+    pub readers: usize,
+    /// Page cache of each connection in KiB. Patches are read through the system's cache, so it need not be large.
+    pub cache_kib: u32,
+    /// Size of a database page in bytes, a power of two from 4096 to 65536; fixed when the database is created.
+    pub page_bytes: u32,
+    /// Size of the write-ahead log at which it is folded into the database (at most a quarter of the reserve).
+    pub log_bytes: u64,
+    /// Room kept free so that deletes succeed on a full disk (at most a quarter of what the disk has left).
+    pub reserve_bytes: u64,
+    /// Writes that may wait for the writer; further ones block their caller.
+    pub queue: usize,
+}
 
-impl StoreError {
-    /// The row of the error table.
-    pub fn code(&self) -> ErrorCode {
-        match *self {}
+impl Default for StoreConfig {
+    fn default() -> Self {
+        Self {
+            readers: 8,
+            cache_kib: 2048,
+            page_bytes: 16 << 10,
+            log_bytes: 16 << 20,
+            reserve_bytes: 64 << 20,
+            queue: 256,
+        }
     }
 }
 
@@ -63,7 +99,7 @@ pub struct Page {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ReferencePatch {
     /// New external id.
-    pub external_id: Option<Option<crate::types::ExternalId>>,
+    pub external_id: Option<Option<ExternalId>>,
     /// New location.
     pub location: Option<Option<crate::types::GeoPoint>>,
     /// New heading.
@@ -85,23 +121,36 @@ pub struct VerifyReport {
     pub engine_errors: Vec<String>,
 }
 
+/// A reference taken out of service because its stored bytes are damaged.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Quarantined {
+    /// Which, as far as it can be read.
+    pub id: ReferenceId,
+    /// What is wrong with it.
+    pub reason: String,
+}
+
 /// A durable set of maps. All calls block; callers keep them off the async threads.
 ///
 /// A write returns only after it is fsynced; a reader sees a reference whole or not at all.
 pub trait PlaceStore: Send + Sync {
     /// Stores a reference, creating its map on first use.
+    ///
+    /// Instants are kept to the microsecond in UTC; the returned reference shows them so. The same external id with
+    /// the same content finds the reference that is there; if that one is damaged it is replaced.
     fn insert(&self, new: NewReference) -> Result<Inserted, StoreError>;
+    /// Stores several, each with its own outcome, in their order. Not atomic as a whole; shares syncs of the disk.
+    fn insert_many(&self, new: Vec<NewReference>) -> Vec<Result<Inserted, StoreError>> {
+        new.into_iter().map(|new| self.insert(new)).collect()
+    }
     /// One reference.
     fn get(&self, id: ReferenceId) -> Result<Reference, StoreError>;
     /// The reference with this external id, if any.
-    fn find_external(
-        &self,
-        map: &MapName,
-        external_id: &crate::types::ExternalId,
-    ) -> Result<Option<Reference>, StoreError>;
+    fn find_external(&self, map: &MapName, external_id: &ExternalId) -> Result<Option<Reference>, StoreError>;
     /// Changes metadata; the descriptor stays.
     fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, StoreError>;
-    /// Deletes one reference and returns what it was.
+    /// Deletes one reference and returns what it was. Of one whose own row is damaged only identity, map and model
+    /// are returned; the other fields are empty.
     fn delete(&self, id: ReferenceId) -> Result<Reference, StoreError>;
     /// References of a map (or of all), ascending by id, starting behind `after`.
     fn list(&self, map: Option<&MapName>, after: Option<ReferenceId>, limit: usize) -> Result<Page, StoreError>;
@@ -109,7 +158,8 @@ pub trait PlaceStore: Send + Sync {
     fn maps(&self) -> Result<Vec<MapInfo>, StoreError>;
     /// One map.
     fn map(&self, name: &MapName) -> Result<MapInfo, StoreError>;
-    /// Deletes a map with everything in it; returns how many references that were.
+    /// Deletes a map with everything in it, at once and atomically; returns how many references that were. Their
+    /// room is freed in the background.
     fn delete_map(&self, name: &MapName) -> Result<u64, StoreError>;
     /// Metadata of several references; those that vanished meanwhile are left out.
     fn get_many(&self, ids: &[ReferenceId]) -> Result<Vec<Reference>, StoreError>;
@@ -117,9 +167,27 @@ pub trait PlaceStore: Send + Sync {
     fn patches(&self, id: ReferenceId) -> Result<PackedPatches, StoreError>;
     /// Every global descriptor of a map, to rebuild its index.
     fn scan_globals(&self, map: &MapName, visit: &mut dyn FnMut(GlobalRow)) -> Result<(), StoreError>;
+    /// Gives a map another head: `compute` makes the new global vector from each pooled vector (`[dim]`, unit length
+    /// to half precision). Atomic: all references change to `new_model` or none. Reads and writes go on meanwhile;
+    /// the map's calibration is cleared. An index of the map must be rebuilt afterwards.
+    fn replace_globals(
+        &self,
+        map: &MapName,
+        new_model: ModelId,
+        compute: &mut dyn FnMut(&[f32]) -> Vec<f32>,
+    ) -> Result<(), StoreError>;
+    /// The map's calibration, if it was given one.
+    fn calibration(&self, map: &MapName) -> Result<Option<serde_json::Value>, StoreError>;
+    /// Stores or clears the map's calibration.
+    fn set_calibration(&self, map: &MapName, calibration: Option<serde_json::Value>) -> Result<(), StoreError>;
+    /// References known to be damaged. They are not served; deleting them or sending their image again ends it.
+    fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError>;
+    /// Writes a consistent copy of everything to a new file while the store is in use; returns its size in bytes.
+    /// Put in a data directory under the database's name (`placeformer.db`) it is a store again.
+    fn backup(&self, target: &Path) -> Result<u64, StoreError>;
     /// Reads everything, checks every checksum, quarantines what is damaged.
     fn verify(&self) -> Result<VerifyReport, StoreError>;
-    /// Bytes on disk, and bytes in the engine's own caches.
+    /// Bytes on disk, and the most bytes that the engine's own caches can hold with the connections now open.
     fn footprint(&self) -> Result<(u64, u64), StoreError>;
 }
 
