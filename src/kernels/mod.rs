@@ -3,12 +3,16 @@
 //! | module | holds |
 //! |---|---|
 //! | [`simd`] | which instructions may be used: chosen once at start, or forced by `PLACEFORMER_SIMD` |
+//! | [`homography`] | four-point homographies and inlier counts, in vectors |
+//! | [`similarity`] | best partners among int8 descriptors: running row and column maxima |
 //!
 //! Every kernel takes a [`Simd`] and has a portable twin, which tests compare it with over odd sizes. Where tests ran
 //! on a CPU without AVX-512, that level is still guarded: [`self_check`] compares every kernel with its twin on the
 //! machine at hand before the program computes anything, and a level that disagrees is refused with an error.
 
+pub mod homography;
 pub mod simd;
+pub mod similarity;
 
 pub use simd::{Simd, SimdError, SimdLevel};
 
@@ -16,7 +20,7 @@ pub use simd::{Simd, SimdError, SimdLevel};
 type Check = fn(Simd) -> Result<(), String>;
 
 /// Every kernel's check, by the kernel's name.
-const CHECKS: &[(&str, Check)] = &[];
+const CHECKS: &[(&str, Check)] = &[("homography", homography::check), ("similarity", similarity::check)];
 
 /// Chooses the level and compares every kernel at it with its scalar twin (a few milliseconds). Programs call this
 /// once at start.
