@@ -306,10 +306,8 @@ mod tests {
         let straight = moved([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0], [5.0, 9.0]]);
         let repeated = moved([[0.0, 0.0], [0.0, 0.0], [20.0, 0.0], [5.0, 9.0]]);
         let mut twisted = moved(square);
-        (
-            twisted[0][2..].copy_from_slice(&moved(square)[1][2..]),
-            twisted[1][2..].copy_from_slice(&moved(square)[0][2..]),
-        );
+        twisted[0][2..].copy_from_slice(&moved(square)[1][2..]);
+        twisted[1][2..].copy_from_slice(&moved(square)[0][2..]);
         let mirrored = square.map(|[x, y]| [x, y, -x, y]);
         for corners in [straight, repeated, twisted, mirrored] {
             assert!(!solve_four(Simd::SCALAR, &one_sample(corners), 0.01).valid[0], "{corners:?}");

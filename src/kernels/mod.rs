@@ -10,8 +10,10 @@
 //! on a CPU without AVX-512, that level is still guarded: [`self_check`] compares every kernel with its twin on the
 //! machine at hand before the program computes anything, and a level that disagrees is refused with an error.
 
+#[allow(clippy::needless_range_loop, reason = "lanes, corners and halves index several arrays at once")]
 pub mod homography;
 pub mod simd;
+#[allow(clippy::needless_range_loop, reason = "sections and halves index several arrays at once")]
 pub mod similarity;
 
 pub use simd::{Simd, SimdError, SimdLevel};

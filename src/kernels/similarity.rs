@@ -142,6 +142,11 @@ impl PackedColumns {
         }
     }
 
+    /// The level they are laid out for.
+    pub fn simd(&self) -> Simd {
+        self.simd
+    }
+
     /// Replaces the columns.
     ///
     /// # Panics

@@ -1,7 +1,26 @@
 //! Key patches of a query against those of its candidates: mutual nearest neighbours, homography, score
 //! (paper III-D and III-E).
+//!
+//! | module | step |
+//! |---|---|
+//! | `mutual_nn` | 6: best partners both ways, each pair of scales compared once |
+//! | `ransac`, `refine` | 7: the homography most pairs agree with |
+//! | `score` | 8: inliers added up over the configured unions of scales |
+//!
+//! Working memory is kept by each thread, so that scoring a candidate allocates nothing but its answer.
 
+mod mutual_nn;
+mod ransac;
+mod refine;
+mod score;
+#[cfg(test)]
+mod tests;
+
+use crate::kernels::simd::{self, Simd};
 use crate::types::{Deadline, PackedPatches, ScaleSet};
+use mutual_nn::PreparedQuery;
+use rayon::prelude::*;
+use score::{with_prepared, with_workspace};
 use serde::{Deserialize, Serialize};
 
 /// Settings of re-ranking.
@@ -12,7 +31,7 @@ pub struct RerankConfig {
     pub scales: Vec<ScaleSet>,
     /// Inlier tolerance in multiples of the base patch size.
     pub tolerance_patches: f32,
-    /// Most homographies tried for one combination.
+    /// Most samples of four pairs drawn for one combination; degenerate ones count.
     pub max_iterations: u32,
     /// Probability with which the best homography should have been seen when the search stops early.
     pub confidence: f64,
@@ -62,7 +81,8 @@ pub struct CombinationMatch {
     pub score: CombinationScore,
     /// Every mutual pair.
     pub correspondences: Vec<Correspondence>,
-    /// Row-major homography from query to reference pixels (of the model's input), scaled to h33 = 1.
+    /// Row-major homography from query to reference pixels (of the model's input), scaled to h33 = 1; left as it is
+    /// where h33 is 0 (the horizon passes through the corner of the query).
     pub homography: Option<[f64; 9]>,
 }
 
@@ -91,36 +111,110 @@ pub enum Reranked<E> {
 
 /// The matcher with its settings.
 #[derive(Debug, Clone)]
-pub struct Reranker {}
+pub struct Reranker {
+    config: RerankConfig,
+    simd: Simd,
+}
 
 impl Reranker {
-    /// Prepares a matcher.
-    pub fn new(_config: RerankConfig) -> Self {
-        unimplemented!()
+    /// Prepares a matcher that computes with the process's SIMD level.
+    ///
+    /// # Panics
+    /// Where `PLACEFORMER_SIMD` asks for a level the CPU lacks; programs have checked that at start
+    /// ([`crate::kernels::self_check`]).
+    pub fn new(config: RerankConfig) -> Self {
+        Self::with_simd(config, simd::selected())
+    }
+
+    /// Prepares a matcher that computes at the given level. Every level gives the same scores.
+    pub fn with_simd(config: RerankConfig, simd: Simd) -> Self {
+        Self { config, simd }
+    }
+
+    /// Its settings.
+    pub fn config(&self) -> &RerankConfig {
+        &self.config
     }
 
     /// Scores one pair. Deterministic: the random samples are seeded from the pair's content.
-    pub fn score(&self, _query: &PackedPatches, _reference: &PackedPatches) -> PairScore {
-        unimplemented!()
+    ///
+    /// # Panics
+    /// Where the two were made by different models (descriptors of different lengths), or the parts of one contradict
+    /// each other.
+    pub fn score(&self, query: &PackedPatches, reference: &PackedPatches) -> PairScore {
+        with_prepared(self.simd, query, |prepared| self.score_prepared(prepared, reference))
     }
 
     /// Scores one pair and keeps the evidence.
-    pub fn explain(&self, _query: &PackedPatches, _reference: &PackedPatches) -> Vec<CombinationMatch> {
-        unimplemented!()
+    ///
+    /// # Panics
+    /// As [`score`](Self::score).
+    pub fn explain(&self, query: &PackedPatches, reference: &PackedPatches) -> Vec<CombinationMatch> {
+        with_prepared(self.simd, query, |prepared| {
+            with_workspace(|workspace| workspace.explain(self.simd, &self.config, prepared, reference))
+        })
     }
 
     /// Scores `count` candidates in parallel, loading each through `load`.
+    ///
+    /// Runs on the rayon pool it is called in. Once the deadline has passed no further candidate is begun. A candidate
+    /// takes about a millisecond, so the answer is late by no more than that.
+    ///
+    /// # Panics
+    /// As [`score`](Self::score).
     pub fn rerank<P, E>(
         &self,
-        _query: &PackedPatches,
-        _count: usize,
-        _load: impl Fn(usize) -> Result<P, E> + Sync,
-        _deadline: Option<Deadline>,
+        query: &PackedPatches,
+        count: usize,
+        load: impl Fn(usize) -> Result<P, E> + Sync,
+        deadline: Option<Deadline>,
     ) -> Reranked<E>
     where
         P: std::ops::Deref<Target = PackedPatches>,
         E: Send,
     {
-        unimplemented!()
+        let late = || deadline.is_some_and(Deadline::has_passed);
+        if late() {
+            return Reranked::DeadlinePassed;
+        }
+        let outcomes: Option<Vec<Result<PairScore, E>>> = with_prepared(self.simd, query, |prepared| {
+            let one = |candidate: usize| {
+                if late() {
+                    return None;
+                }
+                let reference = match load(candidate) {
+                    Ok(reference) => reference,
+                    Err(error) => return Some(Err(error)),
+                };
+                if late() {
+                    return None;
+                }
+                Some(Ok(self.score_prepared(prepared, &reference)))
+            };
+            // Candidates differ in cost, so every one may be stolen.
+            (0..count).into_par_iter().with_max_len(1).map(one).collect()
+        });
+        match outcomes {
+            Some(outcomes) => in_order(outcomes),
+            None => Reranked::DeadlinePassed,
+        }
     }
+
+    fn score_prepared(&self, query: &PreparedQuery, reference: &PackedPatches) -> PairScore {
+        with_workspace(|workspace| workspace.score(self.simd, &self.config, query, reference))
+    }
+}
+
+/// Sorts the scored by S, ties in the order given, and lists the failed apart.
+fn in_order<E>(outcomes: Vec<Result<PairScore, E>>) -> Reranked<E> {
+    let (mut ranked, mut failed) = (Vec::with_capacity(outcomes.len()), Vec::new());
+    for (candidate, outcome) in outcomes.into_iter().enumerate() {
+        match outcome {
+            Ok(score) => ranked.push(Ranked { candidate, score }),
+            Err(error) => failed.push((candidate, error)),
+        }
+    }
+    // The sort is stable, which keeps the global order among equals.
+    ranked.sort_by_key(|ranked| std::cmp::Reverse(ranked.score.spatial_score));
+    Reranked::Complete { ranked, failed }
 }
