@@ -144,7 +144,7 @@ impl VitWeights {
     }
 
     /// Every tensor with its fused name and shape, in a fixed order.
-    fn tensors(&self) -> Vec<(String, Vec<usize>, &[f32])> {
+    pub fn tensors(&self) -> Vec<(String, Vec<usize>, &[f32])> {
         let Geometry { dim, patch, mlp_dim, .. } = self.geometry;
         let mut all: Vec<(String, Vec<usize>, &[f32])> = vec![
             ("cls_token".into(), vec![1, 1, dim], &self.cls_token),
@@ -173,6 +173,50 @@ impl VitWeights {
         all.push(("norm.weight".into(), vec![dim], &self.norm.weight));
         all.push(("norm.bias".into(), vec![dim], &self.norm.bias));
         all
+    }
+
+    /// Overwrites the tensor with this fused name; false if there is none of this name and length.
+    pub fn replace(&mut self, name: &str, values: &[f32]) -> bool {
+        match self.tensor_mut(name) {
+            Some(tensor) if tensor.len() == values.len() => {
+                tensor.copy_from_slice(values);
+                true
+            }
+            _ => false,
+        }
+    }
+
+    fn tensor_mut(&mut self, name: &str) -> Option<&mut Vec<f32>> {
+        let Some(rest) = name.strip_prefix("blocks.") else {
+            return match name {
+                "cls_token" => Some(&mut self.cls_token),
+                "pos_embed" => Some(&mut self.positions),
+                "patch_embed.proj.weight" => Some(&mut self.patch_embed.weight),
+                "patch_embed.proj.bias" => Some(&mut self.patch_embed.bias),
+                "norm.weight" => Some(&mut self.norm.weight),
+                "norm.bias" => Some(&mut self.norm.bias),
+                _ => None,
+            };
+        };
+        let (index, part) = rest.split_once('.')?;
+        let block = self.blocks.get_mut(index.parse::<usize>().ok()?)?;
+        match part {
+            "norm1.weight" => Some(&mut block.norm1.weight),
+            "norm1.bias" => Some(&mut block.norm1.bias),
+            "norm2.weight" => Some(&mut block.norm2.weight),
+            "norm2.bias" => Some(&mut block.norm2.bias),
+            "attn.qkv.weight" => Some(&mut block.qkv.weight),
+            "attn.qkv.bias" => Some(&mut block.qkv.bias),
+            "attn.proj.weight" => Some(&mut block.proj.weight),
+            "attn.proj.bias" => Some(&mut block.proj.bias),
+            "mlp.fc1.weight" => Some(&mut block.fc1.weight),
+            "mlp.fc1.bias" => Some(&mut block.fc1.bias),
+            "mlp.fc2.weight" => Some(&mut block.fc2.weight),
+            "mlp.fc2.bias" => Some(&mut block.fc2.bias),
+            "ls1.gamma" => block.layer_scale1.as_mut(),
+            "ls2.gamma" => block.layer_scale2.as_mut(),
+            _ => None,
+        }
     }
 }
 

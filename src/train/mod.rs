@@ -23,6 +23,7 @@
 
 mod adam;
 mod augment;
+mod backbone;
 mod checkpoint;
 mod error;
 mod head;
@@ -34,6 +35,7 @@ mod trainer;
 mod triplets;
 
 pub use augment::{Augmentation, augment};
+pub use backbone::{BackboneModel, TrainableBlocks};
 pub use error::TrainError;
 pub use head::{HeadModel, PooledTokens};
 pub use log::{CycleRecord, read_log};

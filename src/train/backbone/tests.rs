@@ -1,0 +1,146 @@
+use super::*;
+use crate::extract::{BlockWeights, CandleEncoder, Encoder, Geometry, Linear, Norm, Preset};
+use crate::types::ImageSize;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+const GEOMETRY: Geometry = Geometry { depth: 3, dim: 8, heads: 2, patch: 4, mlp_dim: 16, layer_scale: true };
+const SIZE: ImageSize = ImageSize { width: 16, height: 12 };
+
+fn spec(token_norm: bool) -> EncoderSpec {
+    EncoderSpec { input_size: SIZE, exit_block: 1, token_norm, attention_block: 1 }
+}
+
+fn random(rng: &mut ChaCha8Rng, count: usize) -> Vec<f32> {
+    (0..count).map(|_| rng.random_range(-0.6f32..0.6)).collect()
+}
+
+fn weights() -> VitWeights {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let rng = &mut rng;
+    let Geometry { depth, dim, patch, mlp_dim, .. } = GEOMETRY;
+    let linear =
+        |rng: &mut _, out: usize, input: usize| Linear { weight: random(rng, out * input), bias: random(rng, out) };
+    let norm = |rng: &mut _| Norm { weight: random(rng, dim), bias: random(rng, dim) };
+    VitWeights {
+        preset: Preset::Dinov2Vits14,
+        geometry: GEOMETRY,
+        position_grid: (5, 5),
+        patch_embed: linear(rng, dim, 3 * patch * patch),
+        cls_token: random(rng, dim),
+        positions: random(rng, 26 * dim),
+        blocks: (0..depth)
+            .map(|_| BlockWeights {
+                norm1: norm(rng),
+                qkv: linear(rng, 3 * dim, dim),
+                proj: linear(rng, dim, dim),
+                layer_scale1: Some(random(rng, dim)),
+                norm2: norm(rng),
+                fc1: linear(rng, mlp_dim, dim),
+                fc2: linear(rng, dim, mlp_dim),
+                layer_scale2: Some(random(rng, dim)),
+            })
+            .collect(),
+        norm: norm(rng),
+    }
+}
+
+fn model(trainable: TrainableBlocks, token_norm: bool) -> BackboneModel {
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    let head = (random(&mut rng, GLOBAL_DIM * GEOMETRY.dim), random(&mut rng, GLOBAL_DIM));
+    let (images, augmentation) = (ImageConfig::default(), Augmentation::NONE);
+    BackboneModel::new(weights(), spec(token_norm), (&head.0, &head.1), trainable, images, augmentation).unwrap()
+}
+
+fn images(count: usize) -> Vec<ImageTensor> {
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    (0..count).map(|_| ImageTensor { size: SIZE, data: random(&mut rng, 3 * 16 * 12) }).collect()
+}
+
+#[test]
+fn tokens_are_those_of_the_encoder_that_serves() {
+    for token_norm in [false, true] {
+        let (model, images) = (model(TrainableBlocks::All, token_norm), images(3));
+        let trained = model.tokens(&images).unwrap();
+        let served = CandleEncoder::new(&weights(), &spec(token_norm)).unwrap().encode(&images).unwrap();
+        for (index, expected) in served.iter().enumerate() {
+            let tokens = trained.get(index).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            assert_eq!(tokens.len(), expected.tokens.len());
+            let worst = tokens.iter().zip(&expected.tokens).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(worst < 2e-5, "image {index}: {worst}");
+        }
+    }
+}
+
+/// Loss used for checking gradients: anything that depends on every token unevenly.
+fn loss(model: &BackboneModel, images: &[ImageTensor]) -> Tensor {
+    let tokens = model.tokens(images).unwrap();
+    let count = tokens.elem_count();
+    let uneven: Vec<f32> = (0..count).map(|i| ((i * 7919 % 101) as f32 - 50.0) / 50.0).collect();
+    let uneven = Tensor::from_vec(uneven, tokens.shape(), &Device::Cpu).unwrap();
+    (tokens * uneven).unwrap().sum_all().unwrap()
+}
+
+#[test]
+fn gradients_of_every_kind_of_weight_agree_with_finite_differences() {
+    let (model, images) = (model(TrainableBlocks::All, true), images(2));
+    let gradients = loss(&model, &images).backward().unwrap();
+    let names = [
+        "patch_embed.proj.weight",
+        "cls_token",
+        "pos_embed",
+        "blocks.0.attn.qkv.weight",
+        "blocks.0.norm1.weight",
+        "blocks.1.mlp.fc1.weight",
+        "blocks.1.attn.proj.bias",
+        "blocks.0.ls2.gamma",
+        "norm.bias",
+    ];
+    for name in names {
+        let variable = &model.variables[name];
+        let analytic = gradients.get(variable.as_tensor()).unwrap_or_else(|| panic!("no gradient of {name}"));
+        let analytic = analytic.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let start = variable.as_tensor().copy().unwrap();
+        // The entry with the largest gradient: there the difference quotient is farthest from rounding noise.
+        let at = (0..analytic.len()).max_by(|a, b| analytic[*a].abs().total_cmp(&analytic[*b].abs())).unwrap();
+        let value_at = |shift: f32| {
+            let mut values = start.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            values[at] += shift;
+            variable.set(&Tensor::from_vec(values, start.shape(), &Device::Cpu).unwrap()).unwrap();
+            f64::from(loss(&model, &images).to_scalar::<f32>().unwrap())
+        };
+        let step = 4e-3f32;
+        let numeric = (value_at(step) - value_at(-step)) / f64::from(2.0 * step);
+        variable.set(&start).unwrap();
+        let (analytic, tolerance) = (f64::from(analytic[at]), 0.02 * numeric.abs() + 1e-2);
+        assert!((numeric - analytic).abs() < tolerance, "{name}[{at}]: {numeric} against {analytic}");
+    }
+}
+
+#[test]
+fn only_the_blocks_asked_for_move() {
+    let names = |trainable| model(trainable, false).variables.keys().cloned().collect::<Vec<_>>();
+    let last = names(TrainableBlocks::Last(1));
+    assert!(last.iter().all(|name| name.starts_with("blocks.1.") || name.starts_with("head.")), "{last:?}");
+    assert_eq!(last.len(), 14 + 2);
+    let all = names(TrainableBlocks::All);
+    assert!(all.contains(&"pos_embed".to_owned()) && !all.iter().any(|name| name.starts_with("blocks.2.")));
+    // Without a norm behind the exit block its weights have no gradient, and are left alone.
+    assert!(!all.iter().any(|name| name.starts_with("norm.")));
+    let (head, images) = ((vec![0.0; GLOBAL_DIM * 8], vec![0.0; GLOBAL_DIM]), ImageConfig::default());
+    let trainable = TrainableBlocks::Last(3);
+    let made = BackboneModel::new(weights(), spec(false), (&head.0, &head.1), trainable, images, Augmentation::NONE);
+    assert!(made.is_err());
+}
+
+#[test]
+fn every_tensor_can_be_written_back_by_name() {
+    let mut copy = weights();
+    let tensors: Vec<_> = weights().tensors().into_iter().map(|(name, _, values)| (name, values.len())).collect();
+    for (name, length) in tensors {
+        assert!(copy.replace(&name, &vec![0.25; length]), "{name}");
+        assert!(!copy.replace(&name, &vec![0.25; length + 1]), "{name}");
+    }
+    assert!(copy.tensors().iter().all(|(_, _, values)| values.iter().all(|value| *value == 0.25)));
+    assert!(!copy.replace("blocks.9.norm1.weight", &[0.0; 8]));
+}
