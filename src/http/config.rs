@@ -1,0 +1,142 @@
+//! Settings of the web surface.
+
+use crate::types::InvalidValue;
+use serde::{Deserialize, Serialize};
+
+/// Limits and timeouts of connections and bodies.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct HttpConfig {
+    /// Address and port; port 0 picks a free one.
+    pub listen: String,
+    /// Connections open at once; further ones wait in the kernel's backlog.
+    pub max_connections: usize,
+    /// Time for a request's head to arrive, also between two requests of one connection, in milliseconds.
+    pub header_timeout_ms: u64,
+    /// Time for a whole body to arrive, in milliseconds.
+    pub body_timeout_ms: u64,
+    /// Longest pause within a body, in milliseconds.
+    pub body_idle_timeout_ms: u64,
+    /// Largest head in bytes.
+    pub max_header_bytes: usize,
+    /// Bytes of bodies held at once over all requests.
+    pub max_buffered_bytes: usize,
+    /// Most references in one page of a listing.
+    pub max_page: usize,
+    /// Time between failing readiness and refusing connections, in milliseconds: a balancer notices meanwhile.
+    pub drain_delay_ms: u64,
+    /// Time for requests under way to finish when stopping, in milliseconds.
+    pub drain_timeout_ms: u64,
+}
+
+impl Default for HttpConfig {
+    fn default() -> Self {
+        Self {
+            listen: "127.0.0.1:8080".into(),
+            max_connections: 1024,
+            header_timeout_ms: 15_000,
+            body_timeout_ms: 30_000,
+            body_idle_timeout_ms: 10_000,
+            max_header_bytes: 32 << 10,
+            max_buffered_bytes: 512 << 20,
+            max_page: 1000,
+            drain_delay_ms: 0,
+            drain_timeout_ms: 20_000,
+        }
+    }
+}
+
+impl HttpConfig {
+    /// Checks what the types cannot.
+    pub fn check(&self) -> Result<(), InvalidValue> {
+        let positive = [
+            ("http.max_connections", self.max_connections as u64),
+            ("http.header_timeout_ms", self.header_timeout_ms),
+            ("http.body_timeout_ms", self.body_timeout_ms),
+            ("http.body_idle_timeout_ms", self.body_idle_timeout_ms),
+            ("http.max_buffered_bytes", self.max_buffered_bytes as u64),
+            ("http.max_page", self.max_page as u64),
+        ];
+        if let Some((field, _)) = positive.iter().find(|(_, value)| *value == 0) {
+            return Err(InvalidValue::new(field, "0 would refuse everything"));
+        }
+        if self.max_header_bytes < 8 << 10 {
+            return Err(InvalidValue::new("http.max_header_bytes", "use at least 8192"));
+        }
+        Ok(())
+    }
+}
+
+/// Who may do what. Without keys the service is open.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct AuthConfig {
+    /// The keys that are accepted.
+    pub keys: Vec<ApiKey>,
+    /// Whether `/metrics` needs a key, too.
+    pub protect_metrics: bool,
+    /// Requests per second of one key (of one address without keys); 0 is without bound.
+    pub requests_per_second: u32,
+    /// Requests that may come at once beyond that pace; 0 is as many as a second's.
+    pub burst: u32,
+}
+
+/// What a key allows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Role {
+    /// Queries, matches and listings.
+    Read,
+    /// Everything.
+    Write,
+}
+
+/// One accepted key. The key itself is nowhere kept.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ApiKey {
+    /// Who holds it; appears in logs.
+    pub name: String,
+    /// SHA-256 of the key in hexadecimal.
+    pub sha256: String,
+    /// What it allows.
+    pub role: Role,
+    /// Its own pace, if it differs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub requests_per_second: Option<u32>,
+}
+
+impl AuthConfig {
+    /// Checks names and hashes.
+    pub fn check(&self) -> Result<(), InvalidValue> {
+        let mut names = std::collections::HashSet::new();
+        for key in &self.keys {
+            if key.name.is_empty() || !names.insert(&key.name) {
+                return Err(InvalidValue::new("auth.keys", format!("the name {:?} is empty or used twice", key.name)));
+            }
+            key.hash()?;
+        }
+        Ok(())
+    }
+}
+
+impl ApiKey {
+    /// The 32 bytes of the hash.
+    pub fn hash(&self) -> Result<[u8; 32], InvalidValue> {
+        let wrong = || {
+            InvalidValue::new(
+                "auth.keys",
+                format!("sha256 of key {:?} is not 64 hexadecimal digits (printf %s KEY | sha256sum)", self.name),
+            )
+        };
+        if self.sha256.len() != 64 || !self.sha256.is_ascii() {
+            return Err(wrong());
+        }
+        let mut hash = [0; 32];
+        for (byte, digits) in hash.iter_mut().zip(self.sha256.as_bytes().chunks_exact(2)) {
+            let digits = std::str::from_utf8(digits).map_err(|_| wrong())?;
+            *byte = u8::from_str_radix(digits, 16).map_err(|_| wrong())?;
+        }
+        Ok(hash)
+    }
+}

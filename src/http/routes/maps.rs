@@ -1,0 +1,90 @@
+//! `/maps`: sets of references that are searched together.
+
+use crate::error::ErrorCode;
+use crate::http::AppState;
+use crate::http::problem::ApiError;
+use crate::store::MapInfo;
+use crate::types::MapName;
+use axum::Json;
+use axum::extract::{Path, State};
+use serde::Serialize;
+use time::OffsetDateTime;
+use utoipa::ToSchema;
+
+/// A map.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct MapBody {
+    /// Its name.
+    #[schema(example = "harbour")]
+    pub name: String,
+    /// The model that made all its descriptors.
+    pub model: String,
+    /// References in it.
+    pub references: u64,
+    /// When it was created.
+    #[serde(with = "time::serde::rfc3339")]
+    pub created_at: OffsetDateTime,
+}
+
+impl From<MapInfo> for MapBody {
+    fn from(info: MapInfo) -> Self {
+        Self {
+            name: info.name.to_string(),
+            model: info.model.to_string(),
+            references: info.references,
+            created_at: info.created_at,
+        }
+    }
+}
+
+/// All maps.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct MapList {
+    /// By name.
+    maps: Vec<MapBody>,
+}
+
+/// What became of a map.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct MapDeleted {
+    /// References that were deleted with it.
+    references_deleted: u64,
+}
+
+/// List maps
+///
+/// All of them, by name.
+#[utoipa::path(get, path = "/maps", tag = "maps", responses(
+    (status = 200, description = "All maps.", body = MapList),
+))]
+pub async fn list(State(state): State<AppState>) -> Result<Json<MapList>, ApiError> {
+    let maps = state.service()?.maps().await?;
+    Ok(Json(MapList { maps: maps.into_iter().map(Into::into).collect() }))
+}
+
+fn parse_name(text: &str) -> Result<MapName, ApiError> {
+    text.parse().map_err(|error| ApiError::new(ErrorCode::MapNotFound, format!("no map can have this name: {error}")))
+}
+
+/// One map
+///
+/// With the model it is bound to and its size.
+#[utoipa::path(get, path = "/maps/{map}", tag = "maps",
+    params(("map" = String, Path, description = "The map's name.")), responses(
+    (status = 200, description = "The map.", body = MapBody),
+))]
+pub async fn get(State(state): State<AppState>, Path(map): Path<String>) -> Result<Json<MapBody>, ApiError> {
+    Ok(Json(state.service()?.map(parse_name(&map)?).await?.into()))
+}
+
+/// Delete a map
+///
+/// With every reference in it.
+#[utoipa::path(delete, path = "/maps/{map}", tag = "maps",
+    params(("map" = String, Path, description = "The map's name.")), responses(
+    (status = 200, description = "It is gone.", body = MapDeleted),
+))]
+pub async fn delete(State(state): State<AppState>, Path(map): Path<String>) -> Result<Json<MapDeleted>, ApiError> {
+    let references_deleted = state.service()?.delete_map(parse_name(&map)?).await?;
+    Ok(Json(MapDeleted { references_deleted }))
+}

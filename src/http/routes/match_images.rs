@@ -1,0 +1,129 @@
+//! `/match`: the evidence that two images show the same place.
+
+use super::shapes::{timed, timings_ms};
+use crate::http::AppState;
+use crate::http::body::read_upload;
+use crate::http::problem::ApiError;
+use crate::pipeline::{MatchSide, Matched};
+use crate::rerank::CombinationMatch;
+use axum::extract::{Request, State};
+use axum::response::Response;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use utoipa::{IntoParams, ToSchema};
+
+/// What to match the query image against.
+#[derive(Debug, Default, Deserialize, IntoParams, ToSchema)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct MatchParams {
+    /// A stored reference; instead of a second image.
+    #[schema(format = Uuid)]
+    #[param(format = Uuid)]
+    pub reference_id: Option<String>,
+}
+
+/// Correspondences and homographies of a pair.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct MatchAnswerBody {
+    /// S, the number of inliers over all scale combinations.
+    pub spatial_score: u32,
+    /// By scale combination: `s11`, `s12`, `s23`, ...
+    #[schema(value_type = std::collections::HashMap<String, CombinationMatchBody>)]
+    pub combinations: BTreeMap<String, CombinationMatchBody>,
+    /// Positions are pixels of images of this size; both images were resized to it.
+    pub input_size: SizeBody,
+    /// Milliseconds per stage.
+    #[schema(value_type = std::collections::HashMap<String, f64>)]
+    pub timings_ms: BTreeMap<&'static str, f64>,
+    /// The model that computed it.
+    pub model: String,
+}
+
+/// Width and height in pixels.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct SizeBody {
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+/// One scale combination with its evidence.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct CombinationMatchBody {
+    /// Mutual nearest neighbours.
+    pub matches: u32,
+    /// Of these, how many the homography explains.
+    pub inliers: u32,
+    /// Row-major 3x3 matrix from query pixels to reference pixels; null if none was found.
+    #[schema(min_items = 9, max_items = 9)]
+    pub homography: Option<Vec<f64>>,
+    /// Every mutual pair.
+    pub correspondences: Vec<CorrespondenceBody>,
+}
+
+/// Two key patches that are each other's nearest.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct CorrespondenceBody {
+    /// Centre in the query image, x and y in pixels.
+    #[schema(min_items = 2, max_items = 2)]
+    pub query: [f32; 2],
+    /// Scale of the query's patch: 1, 2 or 3.
+    pub query_scale: usize,
+    /// Centre in the reference image, x and y in pixels.
+    #[schema(min_items = 2, max_items = 2)]
+    pub reference: [f32; 2],
+    /// Scale of the reference's patch: 1, 2 or 3.
+    pub reference_scale: usize,
+    /// Whether the homography explains it.
+    pub inlier: bool,
+}
+
+/// Match two images
+///
+/// Send the images as the multipart parts `query` and `reference`, as base64 in JSON under the same names, or the
+/// query as the raw body with `reference_id`.
+#[utoipa::path(post, path = "/match", tag = "query", params(MatchParams), responses(
+    (status = 200, description = "The correspondences and homographies.", body = MatchAnswerBody),
+))]
+pub async fn match_images(State(state): State<AppState>, request: Request) -> Result<Response, ApiError> {
+    let service = state.service()?;
+    let mut upload = read_upload::<MatchParams>(&state, request, &["query", "reference"]).await?;
+    let query = upload.take("query")?;
+    let other = match (upload.take_optional("reference")?, upload.params.reference_id.take()) {
+        (Some(image), None) => MatchSide::Image(image),
+        (None, Some(id)) => MatchSide::Reference(id.parse()?),
+        _ => return Err(ApiError::invalid("give either the image \"reference\" or reference_id")),
+    };
+    let answer = service.match_images(query, other).await?;
+    let pair = &answer.matched;
+    let body = MatchAnswerBody {
+        spatial_score: pair.combinations.iter().map(|one| one.score.inliers).sum(),
+        combinations: pair.combinations.iter().map(|one| named(pair, one)).collect(),
+        input_size: SizeBody { width: answer.input_size.width, height: answer.input_size.height },
+        timings_ms: timings_ms(&answer.timings),
+        model: answer.model.to_string(),
+    };
+    Ok(timed(body, &answer.timings))
+}
+
+fn named(pair: &Matched, one: &CombinationMatch) -> (String, CombinationMatchBody) {
+    let correspondences = one.correspondences.iter().map(|c| {
+        let (query, reference) = (c.query as usize, c.reference as usize);
+        CorrespondenceBody {
+            query: pair.query.centre(query),
+            query_scale: pair.query.scale_of(query),
+            reference: pair.reference.centre(reference),
+            reference_scale: pair.reference.scale_of(reference),
+            inlier: c.inlier,
+        }
+    });
+    let body = CombinationMatchBody {
+        matches: one.score.matches,
+        inliers: one.score.inliers,
+        homography: one.homography.map(|h| h.to_vec()),
+        correspondences: correspondences.collect(),
+    };
+    (one.score.scales.score_name(), body)
+}

@@ -1,0 +1,199 @@
+//! `/query`: which place does this photo show?
+
+use super::shapes::{LocationBody, location, timed, timings_ms};
+use crate::http::AppState;
+use crate::http::body::read_upload;
+use crate::http::problem::ApiError;
+use crate::pipeline::{QueryAnswer, QueryOptions, QueryRequest, QueryResult};
+use crate::rerank::PairScore;
+use crate::types::{Deadline, GeoCircle, GeoPoint, MapName, ReferenceFilter};
+use axum::extract::{Request, State};
+use axum::response::Response;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+use std::collections::BTreeMap;
+use std::time::Duration;
+use time::OffsetDateTime;
+use utoipa::{IntoParams, ToSchema};
+
+/// Where to look, how hard, and how long.
+#[derive(Debug, Default, Deserialize, IntoParams, ToSchema)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct QueryParams {
+    /// The map to look in. Required here or in the JSON.
+    #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", value_type = Option<String>)]
+    #[param(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", value_type = Option<String>, example = "harbour")]
+    #[serde(default)]
+    pub map: Option<MapName>,
+    /// Results wanted; 10 unless configured otherwise.
+    #[schema(minimum = 1, maximum = 1000)]
+    #[param(minimum = 1, maximum = 1000, example = 10)]
+    pub top_k: Option<usize>,
+    /// Nearest neighbours that are re-ranked; 100 unless configured otherwise.
+    #[schema(minimum = 1, maximum = 1000)]
+    #[param(minimum = 1, maximum = 1000, example = 100)]
+    pub candidates: Option<usize>,
+    /// False: answer with the global ranking.
+    pub rerank: Option<bool>,
+    /// Only references around this position, `lat,lon`; needs `radius_m`.
+    #[param(example = "51.5072,-0.1276")]
+    pub near: Option<String>,
+    /// Radius around `near` in metres.
+    #[schema(exclusive_minimum = 0)]
+    #[param(exclusive_minimum = 0, example = 500)]
+    pub radius_m: Option<f64>,
+    /// Only references captured at or after this time (RFC 3339).
+    #[schema(value_type = Option<String>, format = DateTime)]
+    #[param(value_type = Option<String>, format = DateTime)]
+    #[serde(default, with = "time::serde::rfc3339::option")]
+    pub captured_after: Option<OffsetDateTime>,
+    /// Only references captured before this time (RFC 3339).
+    #[schema(value_type = Option<String>, format = DateTime)]
+    #[param(value_type = Option<String>, format = DateTime)]
+    #[serde(default, with = "time::serde::rfc3339::option")]
+    pub captured_before: Option<OffsetDateTime>,
+    /// Milliseconds for the answer, counted from the arrival of the request's head. Too short for re-ranking, the
+    /// answer is the global ranking and says `"reranked": false`.
+    #[schema(minimum = 1)]
+    #[param(minimum = 1, example = 2000)]
+    pub deadline_ms: Option<u64>,
+}
+
+impl QueryParams {
+    fn near(&self) -> Result<Option<GeoCircle>, ApiError> {
+        match (&self.near, self.radius_m) {
+            (Some(near), Some(radius_m)) => Ok(Some(GeoCircle::new(parse_point(near)?, radius_m)?)),
+            (None, None) => Ok(None),
+            _ => Err(ApiError::invalid("near and radius_m belong together: give both or neither")),
+        }
+    }
+}
+
+fn parse_point(text: &str) -> Result<GeoPoint, ApiError> {
+    let wrong = || ApiError::invalid(format!("near: {text:?} is not LAT,LON, such as 51.5072,-0.1276"));
+    let (lat, lon) = text.split_once(',').ok_or_else(wrong)?;
+    let parse = |part: &str| part.trim().parse::<f64>().map_err(|_| wrong());
+    Ok(GeoPoint::new(parse(lat)?, parse(lon)?)?)
+}
+
+/// The ranked places.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct QueryAnswerBody {
+    /// Best first.
+    pub results: Vec<QueryResultBody>,
+    /// Whether the order comes from re-ranking; else it is the order of global distance.
+    pub reranked: bool,
+    /// Milliseconds per stage, as in the `Server-Timing` header.
+    #[schema(value_type = std::collections::HashMap<String, f64>, example = json!({"decode": 6.1, "extract": 210.0, "rerank": 44.9}))]
+    pub timings_ms: BTreeMap<&'static str, f64>,
+    /// The model that computed it.
+    pub model: String,
+}
+
+/// One place found.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct QueryResultBody {
+    /// 1 is the best.
+    pub rank: usize,
+    /// The reference that shows it.
+    #[schema(format = Uuid)]
+    pub reference_id: String,
+    /// The builder's own name for it.
+    pub external_id: Option<String>,
+    /// Where it was taken.
+    pub location: Option<LocationBody>,
+    /// Euclidean distance of the global descriptors, 0 to 2.
+    pub global_distance: f32,
+    /// S, the number of inliers over all scale combinations; null if this result was not re-ranked.
+    pub spatial_score: Option<u32>,
+    /// S by scale combination; null if this result was not re-ranked.
+    #[schema(example = json!({"s11": {"matches": 96, "inliers": 41}, "s12": {"matches": 130, "inliers": 60}}))]
+    pub scores: Option<BTreeMap<String, CombinationBody>>,
+    /// When it was taken.
+    #[serde(with = "time::serde::rfc3339::option")]
+    pub captured_at: Option<OffsetDateTime>,
+    /// Anything else the builder said.
+    #[schema(value_type = Option<Object>)]
+    pub metadata: Option<Map<String, Value>>,
+}
+
+/// Outcome of one scale combination.
+#[derive(Debug, Clone, Copy, Serialize, ToSchema)]
+pub struct CombinationBody {
+    /// Mutual nearest neighbours.
+    pub matches: u32,
+    /// Of these, how many one homography explains.
+    pub inliers: u32,
+}
+
+impl QueryResultBody {
+    fn new(position: usize, result: QueryResult) -> Self {
+        Self {
+            rank: position + 1,
+            reference_id: result.reference.id.to_string(),
+            location: location(&result.reference),
+            external_id: result.reference.fields.external_id.map(String::from),
+            global_distance: result.global_distance,
+            spatial_score: result.score.as_ref().map(|score| score.spatial_score),
+            scores: result.score.as_ref().map(scores),
+            captured_at: result.reference.fields.captured_at,
+            metadata: result.reference.fields.metadata,
+        }
+    }
+}
+
+fn scores(score: &PairScore) -> BTreeMap<String, CombinationBody> {
+    let body = |inliers, matches| CombinationBody { matches, inliers };
+    score.combinations.iter().map(|one| (one.scales.score_name(), body(one.inliers, one.matches))).collect()
+}
+
+/// Find the places a photo may show
+///
+/// The image is the raw body with the options as query parameters, or a multipart part `image` beside a part `json`,
+/// or base64 in JSON beside the options.
+#[utoipa::path(post, path = "/query", tag = "query", params(QueryParams), responses(
+    (status = 200, description = "The ranked places; none if the map, or what the filter leaves of it, is empty.",
+        body = QueryAnswerBody, headers(("server-timing" = String, description = "Milliseconds per stage."))),
+))]
+pub async fn query(State(state): State<AppState>, request: Request) -> Result<Response, ApiError> {
+    let arrived = std::time::Instant::now();
+    let service = state.service()?;
+    let mut upload = read_upload::<QueryParams>(&state, request, &["image"]).await?;
+    let image = upload.take("image")?;
+    let params = std::mem::take(&mut upload.params);
+    let near = params.near()?;
+    let map = params.map.ok_or_else(|| ApiError::invalid("map: it is required"))?;
+    let options = QueryOptions {
+        top_k: params.top_k,
+        candidates: params.candidates,
+        rerank: params.rerank,
+        filter: ReferenceFilter {
+            near,
+            captured_after: params.captured_after,
+            captured_before: params.captured_before,
+        },
+        deadline: Some(deadline(params.deadline_ms, service.config().deadline_ms, arrived)?),
+    };
+    let answer = service.query(QueryRequest { map, image, options }).await?;
+    Ok(respond(answer))
+}
+
+fn deadline(asked_ms: Option<u64>, most_ms: u64, arrived: std::time::Instant) -> Result<Deadline, ApiError> {
+    if asked_ms == Some(0) {
+        return Err(ApiError::invalid("deadline_ms: it must be at least 1"));
+    }
+    let budget = Duration::from_millis(asked_ms.unwrap_or(most_ms).min(most_ms));
+    Ok(Deadline::after(budget.saturating_sub(arrived.elapsed())))
+}
+
+fn respond(answer: QueryAnswer) -> Response {
+    let results = answer.results.into_iter().enumerate();
+    let body = QueryAnswerBody {
+        results: results.map(|(position, result)| QueryResultBody::new(position, result)).collect(),
+        reranked: answer.reranked,
+        timings_ms: timings_ms(&answer.timings),
+        model: answer.model.to_string(),
+    };
+    timed(body, &answer.timings)
+}

@@ -1,0 +1,255 @@
+//! `/references`: the photos that make up the maps.
+
+use super::shapes::{ReferenceBody, json_object, point, present, timed};
+use crate::error::ErrorCode;
+use crate::http::AppState;
+use crate::http::body::{read_json, read_query, read_upload};
+use crate::http::problem::ApiError;
+use crate::pipeline::IngestRequest;
+use crate::store::ReferencePatch;
+use crate::types::{ExternalId, Heading, MapName, ReferenceFields, ReferenceId};
+use axum::Json;
+use axum::extract::{Path, Request, State};
+use axum::http::{HeaderValue, StatusCode, Uri, header};
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+use time::OffsetDateTime;
+use utoipa::{IntoParams, ToSchema};
+
+/// References in a page when the client does not say.
+const DEFAULT_PAGE: usize = 100;
+
+/// What the map builder says about a photo.
+#[derive(Debug, Default, Deserialize, IntoParams, ToSchema)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct ReferenceParams {
+    /// The map, created on first use: 1 to 64 of `A-Z a-z 0-9 . _ -`. Required here or in the JSON.
+    #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", value_type = Option<String>)]
+    #[param(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", value_type = Option<String>, example = "harbour")]
+    #[serde(default)]
+    pub map: Option<MapName>,
+    /// Your own name for the photo, unique in the map. Sending the same photo under it again changes nothing.
+    #[schema(min_length = 1, max_length = 256, value_type = Option<String>)]
+    #[param(min_length = 1, max_length = 256, value_type = Option<String>, example = "drive7/000123.jpg")]
+    #[serde(default)]
+    pub external_id: Option<ExternalId>,
+    /// Latitude in degrees (WGS84); with `lon` or not at all.
+    #[schema(minimum = -90, maximum = 90)]
+    #[param(minimum = -90, maximum = 90, example = 51.5072)]
+    pub lat: Option<f64>,
+    /// Longitude in degrees (WGS84); with `lat` or not at all.
+    #[schema(minimum = -180, maximum = 180)]
+    #[param(minimum = -180, maximum = 180, example = -0.1276)]
+    pub lon: Option<f64>,
+    /// Where the camera looked, in degrees clockwise from north.
+    #[schema(minimum = -360, maximum = 360)]
+    #[param(minimum = -360, maximum = 360, example = 270)]
+    pub heading: Option<f64>,
+    /// When the photo was taken (RFC 3339).
+    #[schema(value_type = Option<String>, format = DateTime)]
+    #[param(value_type = Option<String>, format = DateTime, example = "2026-05-17T09:30:00Z")]
+    #[serde(default, with = "time::serde::rfc3339::option")]
+    pub captured_at: Option<OffsetDateTime>,
+    /// Anything else, as a JSON object; returned as it came.
+    #[schema(value_type = Option<Object>)]
+    #[param(value_type = Option<String>, example = "{\"camera\":\"left\"}")]
+    #[serde(default, deserialize_with = "json_object")]
+    pub metadata: Option<Map<String, Value>>,
+}
+
+impl ReferenceParams {
+    fn checked(self) -> Result<(MapName, ReferenceFields), ApiError> {
+        let map = self.map.ok_or_else(|| ApiError::invalid("map: it is required"))?;
+        let fields = ReferenceFields {
+            external_id: self.external_id,
+            location: point(self.lat, self.lon)?,
+            heading: self.heading.map(Heading::new).transpose()?,
+            captured_at: self.captured_at,
+            metadata: self.metadata,
+        };
+        Ok((map, fields))
+    }
+}
+
+/// Add a photo to a map
+///
+/// Acknowledged only after it is durable and can be found. The image is the raw body with the fields as query
+/// parameters, or a multipart part `image` beside a part `json`, or base64 in JSON beside the fields.
+#[utoipa::path(post, path = "/references", tag = "references", params(ReferenceParams), responses(
+    (status = 201, description = "It is new, durable and can be found.", body = ReferenceBody,
+        headers(("location" = String, description = "Its path."))),
+    (status = 200, description = "The same photo was there before under this external id.", body = ReferenceBody),
+))]
+pub async fn create(State(state): State<AppState>, request: Request) -> Result<Response, ApiError> {
+    let service = state.service()?;
+    // Before the body is read: who cannot be served need not send it.
+    service.may_store()?;
+    let mut upload = read_upload::<ReferenceParams>(&state, request, &["image"]).await?;
+    let image = upload.take("image")?;
+    let (map, fields) = std::mem::take(&mut upload.params).checked()?;
+    let answer = service.ingest(IngestRequest { map, fields, image }).await?;
+    let location = HeaderValue::from_str(&format!("/references/{}", answer.reference.id));
+    let mut response = timed(ReferenceBody::from(answer.reference), &answer.timings);
+    if answer.created {
+        *response.status_mut() = StatusCode::CREATED;
+    }
+    if let Ok(location) = location {
+        response.headers_mut().insert(header::LOCATION, location);
+    }
+    Ok(response)
+}
+
+/// Which references to list.
+#[derive(Debug, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct ListParams {
+    /// Only this map.
+    #[param(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", value_type = Option<String>)]
+    #[serde(default)]
+    map: Option<MapName>,
+    /// Only the reference with this external id; needs `map`.
+    #[param(min_length = 1, max_length = 256, value_type = Option<String>)]
+    #[serde(default)]
+    external_id: Option<ExternalId>,
+    /// The `next` of the page before.
+    #[param(value_type = Option<String>, format = Uuid)]
+    cursor: Option<String>,
+    /// References in a page.
+    #[param(minimum = 1, maximum = 1000)]
+    limit: Option<usize>,
+}
+
+/// A page of references.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct ReferencePage {
+    /// In the order they were added.
+    references: Vec<ReferenceBody>,
+    /// Pass as `cursor` for the next page; null on the last.
+    next: Option<String>,
+}
+
+/// List references
+///
+/// In the order they were added, page by page.
+#[utoipa::path(get, path = "/references", tag = "references", params(ListParams), responses(
+    (status = 200, description = "A page.", body = ReferencePage),
+))]
+pub async fn list(State(state): State<AppState>, uri: Uri) -> Result<Json<ReferencePage>, ApiError> {
+    let params: ListParams = read_query(&uri)?;
+    let limit = params.limit.unwrap_or(DEFAULT_PAGE.min(state.http.max_page));
+    if !(1..=state.http.max_page).contains(&limit) {
+        return Err(ApiError::invalid(format!("limit: {limit} is outside 1 to {}", state.http.max_page)));
+    }
+    let after = params.cursor.as_deref().map(str::parse::<ReferenceId>).transpose()?;
+    let service = state.service()?;
+    if let Some(external_id) = params.external_id {
+        let map = params.map.ok_or_else(|| ApiError::invalid("external_id: it needs map"))?;
+        let found = service.find_external(map, external_id).await?;
+        return Ok(Json(ReferencePage { references: found.into_iter().map(Into::into).collect(), next: None }));
+    }
+    let page = service.references(params.map, after, limit).await?;
+    Ok(Json(ReferencePage {
+        references: page.references.into_iter().map(Into::into).collect(),
+        next: page.next.map(|id| id.to_string()),
+    }))
+}
+
+fn parse_id(text: &str) -> Result<ReferenceId, ApiError> {
+    let absent = |_| ApiError::new(ErrorCode::ReferenceNotFound, "the id in the path is not a UUID, so nothing has it");
+    text.parse().map_err(absent)
+}
+
+/// One reference
+///
+/// Its metadata; the image itself is not kept.
+#[utoipa::path(get, path = "/references/{id}", tag = "references",
+    params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
+    (status = 200, description = "The reference.", body = ReferenceBody),
+))]
+pub async fn get(State(state): State<AppState>, Path(id): Path<String>) -> Result<Json<ReferenceBody>, ApiError> {
+    Ok(Json(state.service()?.reference(parse_id(&id)?).await?.into()))
+}
+
+/// Fields to change: one left out stays as it is, null clears it.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+#[schema(example = json!({"heading": 90, "metadata": null}))]
+pub struct ReferenceChange {
+    /// Your own name for the photo.
+    #[schema(min_length = 1, max_length = 256, value_type = Option<String>)]
+    #[serde(default, deserialize_with = "present")]
+    external_id: Option<Option<ExternalId>>,
+    /// Latitude in degrees; together with `lon`.
+    #[schema(minimum = -90, maximum = 90, value_type = Option<f64>)]
+    #[serde(default, deserialize_with = "present")]
+    lat: Option<Option<f64>>,
+    /// Longitude in degrees; together with `lat`.
+    #[schema(minimum = -180, maximum = 180, value_type = Option<f64>)]
+    #[serde(default, deserialize_with = "present")]
+    lon: Option<Option<f64>>,
+    /// Degrees clockwise from north.
+    #[schema(minimum = -360, maximum = 360, value_type = Option<f64>)]
+    #[serde(default, deserialize_with = "present")]
+    heading: Option<Option<f64>>,
+    /// When the photo was taken (RFC 3339).
+    #[schema(value_type = Option<String>, format = DateTime)]
+    #[serde(default, deserialize_with = "present")]
+    captured_at: Option<Option<Rfc3339>>,
+    /// Replaces the whole object.
+    #[schema(value_type = Option<Object>)]
+    #[serde(default, deserialize_with = "present")]
+    metadata: Option<Option<Map<String, Value>>>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(transparent)]
+struct Rfc3339(#[serde(with = "time::serde::rfc3339")] OffsetDateTime);
+
+impl ReferenceChange {
+    fn checked(self) -> Result<ReferencePatch, ApiError> {
+        let location = match (self.lat, self.lon) {
+            (None, None) => None,
+            (Some(lat), Some(lon)) => Some(point(lat, lon)?),
+            _ => return Err(ApiError::invalid("lat and lon belong together: change both or neither")),
+        };
+        Ok(ReferencePatch {
+            external_id: self.external_id,
+            location,
+            heading: self.heading.map(|heading| heading.map(Heading::new).transpose()).transpose()?,
+            captured_at: self.captured_at.map(|at| at.map(|Rfc3339(at)| at)),
+            metadata: self.metadata,
+        })
+    }
+}
+
+/// Change a reference's metadata
+///
+/// The photo and what was computed from it stay. A new position is used by the next query.
+#[utoipa::path(patch, path = "/references/{id}", tag = "references", request_body = ReferenceChange,
+    params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
+    (status = 200, description = "The reference as it is now.", body = ReferenceBody),
+))]
+pub async fn update(
+    State(state): State<AppState>,
+    Path(id): Path<String>,
+    request: Request,
+) -> Result<Json<ReferenceBody>, ApiError> {
+    let id = parse_id(&id)?;
+    let change: ReferenceChange = read_json(&state, request).await?;
+    Ok(Json(state.service()?.update(id, change.checked()?).await?.into()))
+}
+
+/// Delete a reference
+///
+/// It is found by no query that begins after the answer.
+#[utoipa::path(delete, path = "/references/{id}", tag = "references",
+    params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
+    (status = 204, description = "It is gone."),
+))]
+pub async fn delete(State(state): State<AppState>, Path(id): Path<String>) -> Result<Response, ApiError> {
+    state.service()?.delete(parse_id(&id)?).await?;
+    Ok(StatusCode::NO_CONTENT.into_response())
+}

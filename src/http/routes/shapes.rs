@@ -1,0 +1,134 @@
+//! Shapes shared by several answers.
+
+use crate::http::problem::ApiError;
+use crate::pipeline::Timings;
+use crate::types::{GeoPoint, Heading, Reference};
+use axum::Json;
+use axum::http::{HeaderName, HeaderValue};
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Deserializer, Serialize};
+use serde_json::{Map, Value};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use time::OffsetDateTime;
+use utoipa::ToSchema;
+
+/// Header with the time in each stage.
+const SERVER_TIMING: HeaderName = HeaderName::from_static("server-timing");
+
+/// Where a photo was taken and where its camera looked.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct LocationBody {
+    /// Latitude in degrees; null on an indoor map.
+    pub lat: Option<f64>,
+    /// Longitude in degrees; null on an indoor map.
+    pub lon: Option<f64>,
+    /// Degrees clockwise from north.
+    pub heading: Option<f64>,
+}
+
+/// A stored reference.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct ReferenceBody {
+    /// Its identity.
+    #[schema(format = Uuid, example = "0197f3c2-7c1e-7d3a-9b1f-2f6f0c1d2e3f")]
+    pub id: String,
+    /// Its map.
+    #[schema(example = "harbour")]
+    pub map: String,
+    /// The builder's own name for it.
+    #[schema(example = "drive7/000123.jpg")]
+    pub external_id: Option<String>,
+    /// Where it was taken.
+    pub location: Option<LocationBody>,
+    /// When it was taken.
+    #[serde(with = "time::serde::rfc3339::option")]
+    pub captured_at: Option<OffsetDateTime>,
+    /// Anything else the builder said.
+    #[schema(value_type = Option<Object>)]
+    pub metadata: Option<Map<String, Value>>,
+    /// SHA-256 of the image as it was sent, in hexadecimal.
+    pub content_sha256: String,
+    /// The model that made its descriptor.
+    pub model: String,
+    /// When it was committed.
+    #[serde(with = "time::serde::rfc3339")]
+    pub created_at: OffsetDateTime,
+}
+
+impl From<Reference> for ReferenceBody {
+    fn from(reference: Reference) -> Self {
+        Self {
+            id: reference.id.to_string(),
+            map: reference.map.to_string(),
+            location: location(&reference),
+            external_id: reference.fields.external_id.map(String::from),
+            captured_at: reference.fields.captured_at,
+            metadata: reference.fields.metadata,
+            content_sha256: reference.content_hash.to_string(),
+            model: reference.model.to_string(),
+            created_at: reference.created_at,
+        }
+    }
+}
+
+/// Location and heading of a reference, if it has either.
+pub fn location(reference: &Reference) -> Option<LocationBody> {
+    let (point, heading) = (reference.fields.location, reference.fields.heading);
+    (point.is_some() || heading.is_some()).then(|| LocationBody {
+        lat: point.map(GeoPoint::lat),
+        lon: point.map(GeoPoint::lon),
+        heading: heading.map(Heading::degrees),
+    })
+}
+
+/// A position from its two halves, of which neither may miss alone.
+pub fn point(lat: Option<f64>, lon: Option<f64>) -> Result<Option<GeoPoint>, ApiError> {
+    match (lat, lon) {
+        (Some(lat), Some(lon)) => Ok(Some(GeoPoint::new(lat, lon)?)),
+        (None, None) => Ok(None),
+        _ => Err(ApiError::invalid("lat and lon belong together: give both or neither")),
+    }
+}
+
+/// Milliseconds per stage; a stage that ran twice counts once, with its sum.
+pub fn timings_ms(timings: &Timings) -> BTreeMap<&'static str, f64> {
+    let mut all = BTreeMap::new();
+    for (stage, took) in timings.iter() {
+        *all.entry(stage.as_str()).or_insert(0.0) += (took.as_secs_f64() * 1e6).round() / 1e3;
+    }
+    all
+}
+
+/// JSON with the timings in a `Server-Timing` header.
+pub fn timed<T: Serialize>(body: T, timings: &Timings) -> Response {
+    let mut header = String::new();
+    for (stage, ms) in timings_ms(timings) {
+        let comma = if header.is_empty() { "" } else { ", " };
+        // Writing to a string cannot fail.
+        let _ = write!(header, "{comma}{stage};dur={ms}");
+    }
+    let mut response = Json(body).into_response();
+    if let (false, Ok(value)) = (header.is_empty(), HeaderValue::from_str(&header)) {
+        response.headers_mut().insert(SERVER_TIMING, value);
+    }
+    response
+}
+
+/// Reads a JSON object, or a string that holds one (as in a query string).
+pub fn json_object<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Map<String, Value>>, D::Error> {
+    use serde::de::Error;
+    match Option::<Value>::deserialize(deserializer)? {
+        None | Some(Value::Null) => Ok(None),
+        Some(Value::Object(object)) => Ok(Some(object)),
+        Some(Value::String(text)) => {
+            serde_json::from_str(&text).map(Some).map_err(|error| D::Error::custom(format!("metadata: {error}")))
+        }
+        Some(_) => Err(D::Error::custom("metadata: it must be a JSON object")),
+    }
+}
+
+/// Tells a field that is absent (`None`) from one that is null (`Some(None)`).
+pub fn present<'de, T: Deserialize<'de>, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Option<T>>, D::Error> {
+    Option::deserialize(deserializer).map(Some)
+}

@@ -1,0 +1,162 @@
+//! Whether the server is ready, and if not, why.
+//!
+//! One [`Health`] is shared by everything. Start-up moves it forward phase by phase, shutdown turns it to draining,
+//! and a full disk holds it back while it lasts. `/readyz` prints the first reason found.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+/// Why the server is not ready.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Unready {
+    /// Weights are being fetched or loaded, or the first inference runs.
+    LoadingModel,
+    /// The store is being opened and brought to the current schema.
+    Migrating,
+    /// The in-memory indexes are being rebuilt from the store.
+    BuildingIndex {
+        /// References indexed so far.
+        done: u64,
+        /// References in the store.
+        total: u64,
+    },
+    /// Stopping: requests under way are finished, new ones go elsewhere.
+    Draining,
+    /// The disk is (almost) full: queries are answered, nothing new is stored.
+    DiskFull,
+}
+
+impl Unready {
+    /// The stable name that `/readyz` prints.
+    pub fn as_str(&self) -> &'static str {
+        match self {
+            Self::LoadingModel => "loading_model",
+            Self::Migrating => "migrating",
+            Self::BuildingIndex { .. } => "building_index",
+            Self::Draining => "draining",
+            Self::DiskFull => "disk_full",
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    LoadingModel,
+    Migrating,
+    BuildingIndex,
+    Serving,
+}
+
+/// The state behind `/readyz`.
+#[derive(Debug)]
+pub struct Health {
+    phase: Mutex<Phase>,
+    indexed: AtomicU64,
+    to_index: AtomicU64,
+    draining: AtomicBool,
+    disk_full: AtomicBool,
+}
+
+impl Default for Health {
+    fn default() -> Self {
+        Self {
+            phase: Mutex::new(Phase::LoadingModel),
+            indexed: AtomicU64::new(0),
+            to_index: AtomicU64::new(0),
+            draining: AtomicBool::new(false),
+            disk_full: AtomicBool::new(false),
+        }
+    }
+}
+
+impl Health {
+    /// The weights are in memory; the store is next.
+    pub fn migrating(&self) {
+        self.enter(Phase::Migrating);
+    }
+
+    /// The store is open; `total` references are to be indexed.
+    pub fn building_index(&self, total: u64) {
+        self.to_index.store(total, Ordering::Relaxed);
+        self.enter(Phase::BuildingIndex);
+    }
+
+    /// `count` more references are indexed.
+    pub fn indexed(&self, count: u64) {
+        self.indexed.fetch_add(count, Ordering::Relaxed);
+    }
+
+    /// Everything is loaded.
+    pub fn serving(&self) {
+        self.enter(Phase::Serving);
+    }
+
+    /// Shutdown has begun.
+    pub fn draining(&self) {
+        self.draining.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether shutdown has begun.
+    pub fn is_draining(&self) -> bool {
+        self.draining.load(Ordering::Relaxed)
+    }
+
+    /// The disk filled up, or has room again.
+    pub fn set_disk_full(&self, full: bool) {
+        if self.disk_full.swap(full, Ordering::Relaxed) != full {
+            if full {
+                tracing::error!("the disk is full: nothing new is stored until there is room");
+            } else {
+                tracing::info!("the disk has room again");
+            }
+        }
+    }
+
+    /// Whether the disk is full.
+    pub fn is_disk_full(&self) -> bool {
+        self.disk_full.load(Ordering::Relaxed)
+    }
+
+    /// The reason for not being ready; `None` when ready.
+    pub fn unready(&self) -> Option<Unready> {
+        if self.is_draining() {
+            return Some(Unready::Draining);
+        }
+        match *self.phase.lock().unwrap_or_else(std::sync::PoisonError::into_inner) {
+            Phase::LoadingModel => Some(Unready::LoadingModel),
+            Phase::Migrating => Some(Unready::Migrating),
+            Phase::BuildingIndex => Some(Unready::BuildingIndex {
+                done: self.indexed.load(Ordering::Relaxed),
+                total: self.to_index.load(Ordering::Relaxed),
+            }),
+            Phase::Serving => self.is_disk_full().then_some(Unready::DiskFull),
+        }
+    }
+
+    fn enter(&self, phase: Phase) {
+        *self.phase.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = phase;
+        tracing::debug!(?phase, "start-up");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_obstacle_is_named() {
+        let health = Health::default();
+        assert_eq!(health.unready(), Some(Unready::LoadingModel));
+        health.migrating();
+        assert_eq!(health.unready(), Some(Unready::Migrating));
+        health.building_index(10);
+        health.indexed(4);
+        assert_eq!(health.unready(), Some(Unready::BuildingIndex { done: 4, total: 10 }));
+        health.serving();
+        assert_eq!(health.unready(), None);
+        health.set_disk_full(true);
+        assert_eq!(health.unready(), Some(Unready::DiskFull));
+        health.draining();
+        assert_eq!(health.unready(), Some(Unready::Draining));
+    }
+}

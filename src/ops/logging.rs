@@ -1,0 +1,80 @@
+//! Logs: for people on a terminal, or one JSON object a line for collectors.
+
+use serde::{Deserialize, Serialize};
+use tracing_subscriber::EnvFilter;
+use tracing_subscriber::fmt::format::FmtSpan;
+
+/// How log lines look.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum LogFormat {
+    /// Coloured text.
+    #[default]
+    Human,
+    /// One JSON object a line.
+    Json,
+}
+
+/// Settings of the logs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LogConfig {
+    /// Text or JSON.
+    pub format: LogFormat,
+    /// Filter in the syntax of `tracing` directives: `info`, `placeformer=debug`, ...
+    pub filter: String,
+}
+
+impl Default for LogConfig {
+    fn default() -> Self {
+        Self { format: LogFormat::Human, filter: "info".into() }
+    }
+}
+
+/// The filter text is not a list of directives.
+#[derive(Debug, thiserror::Error)]
+#[error("log.filter {filter:?} is not valid: {reason}")]
+pub struct InvalidFilter {
+    filter: String,
+    reason: String,
+}
+
+impl LogConfig {
+    /// Checks the filter.
+    pub fn check(&self) -> Result<(), InvalidFilter> {
+        self.directives().map(drop)
+    }
+
+    fn directives(&self) -> Result<EnvFilter, InvalidFilter> {
+        EnvFilter::try_new(&self.filter)
+            .map_err(|error| InvalidFilter { filter: self.filter.clone(), reason: error.to_string() })
+    }
+}
+
+/// Sends all events to standard error from now on. A second call keeps the first one's settings.
+pub fn init(config: &LogConfig) -> Result<(), InvalidFilter> {
+    let lines = tracing_subscriber::fmt()
+        .with_env_filter(config.directives()?)
+        .with_span_events(FmtSpan::NONE)
+        .with_writer(std::io::stderr);
+    let outcome = match config.format {
+        LogFormat::Human => lines.try_init(),
+        LogFormat::Json => lines.json().flatten_event(true).with_current_span(true).with_span_list(false).try_init(),
+    };
+    if outcome.is_err() {
+        tracing::debug!("logs were set up before");
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_wrong_filter_is_named() {
+        let config = LogConfig { filter: "placeformer=loud".into(), ..Default::default() };
+        assert!(config.check().unwrap_err().to_string().contains("placeformer=loud"));
+        assert!(LogConfig::default().check().is_ok());
+    }
+}

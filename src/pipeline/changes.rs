@@ -1,0 +1,87 @@
+//! Changing and deleting references and maps, in the store and in the index together.
+
+use super::blocking::blocking;
+use super::{PipelineError, Service};
+use crate::search::IndexEntry;
+use crate::store::ReferencePatch;
+use crate::types::{MapName, Reference, ReferenceFields, ReferenceId};
+use std::sync::Arc;
+
+impl Service {
+    /// Changes a reference's metadata; its image and descriptor stay.
+    pub async fn update(self: &Arc<Self>, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, PipelineError> {
+        let metadata = patch.metadata.clone().flatten();
+        self.check_metadata(&ReferenceFields { metadata, ..Default::default() })?;
+        self.write(move |service| service.update_now(id, patch)).await
+    }
+
+    /// Deletes a reference and returns what it was.
+    pub async fn delete(self: &Arc<Self>, id: ReferenceId) -> Result<Reference, PipelineError> {
+        self.write(move |service| service.delete_now(id)).await
+    }
+
+    /// Deletes a map with everything in it; returns how many references that were.
+    pub async fn delete_map(self: &Arc<Self>, name: MapName) -> Result<u64, PipelineError> {
+        self.write(move |service| service.delete_map_now(&name)).await
+    }
+
+    fn update_now(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, PipelineError> {
+        let moves = patch.location.is_some() || patch.captured_at.is_some();
+        let entry = self.maps.entry(&self.store.get(id)?.map);
+        let _changing = entry.changing();
+        let reference = self.store.update(id, patch)?;
+        if let Some(live) = entry.live()
+            && moves
+        {
+            self.reindex(&live.index, &reference)?;
+        }
+        Ok(reference)
+    }
+
+    fn reindex(&self, index: &crate::search::MapIndex, reference: &Reference) -> Result<(), PipelineError> {
+        let mut found = None;
+        self.store.scan_globals(&reference.map, &mut |row| {
+            if row.reference == reference.id {
+                found = Some(row);
+            }
+        })?;
+        if let Some(row) = found {
+            index.insert(IndexEntry {
+                id: row.reference,
+                global: row.global,
+                location: row.location,
+                captured_at: row.captured_at,
+            });
+        }
+        Ok(())
+    }
+
+    fn delete_now(&self, id: ReferenceId) -> Result<Reference, PipelineError> {
+        let entry = self.maps.entry(&self.store.get(id)?.map);
+        let _changing = entry.changing();
+        let reference = self.store.delete(id)?;
+        if let Some(live) = entry.live() {
+            live.index.remove(id);
+        }
+        self.patches.forget(id);
+        Ok(reference)
+    }
+
+    fn delete_map_now(&self, name: &MapName) -> Result<u64, PipelineError> {
+        let entry = self.maps.live(name).map(|_| self.maps.entry(name));
+        let entry = entry.ok_or_else(|| PipelineError::MapNotFound(name.clone()))?;
+        let _changing = entry.changing();
+        let deleted = self.store.delete_map(name)?;
+        entry.clear();
+        Ok(deleted)
+    }
+
+    /// Runs a write to its end even if the caller goes away meanwhile: store and index change together.
+    async fn write<T: Send + 'static>(
+        self: &Arc<Self>,
+        work: impl FnOnce(&Self) -> Result<T, PipelineError> + Send + 'static,
+    ) -> Result<T, PipelineError> {
+        let service = self.clone();
+        blocking(move || work(&service)).await.map_err(|_| PipelineError::Panicked { stage: "the store" })?
+    }
+}

@@ -1,0 +1,108 @@
+//! Why a request through the pipeline failed.
+
+use crate::error::ErrorCode;
+use crate::extract::ExtractError;
+use crate::image::ImageError;
+use crate::store::StoreError;
+use crate::types::{ExternalId, InvalidValue, MapName, ModelId};
+use std::time::Duration;
+
+/// Everything that can end a request early.
+#[derive(Debug, thiserror::Error)]
+pub enum PipelineError {
+    /// The image was refused.
+    #[error(transparent)]
+    Image(#[from] ImageError),
+    /// The decoder itself broke on this image; the process goes on.
+    #[error("the decoder failed on this image")]
+    DecoderPanicked,
+    /// The model failed.
+    #[error(transparent)]
+    Extract(#[from] ExtractError),
+    /// The store refused or failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// An option is out of range.
+    #[error(transparent)]
+    Invalid(#[from] InvalidValue),
+    /// No such map.
+    #[error("there is no map {0}")]
+    MapNotFound(MapName),
+    /// The map's descriptors cannot be compared with this server's.
+    #[error("map {map} was built with model {map_model}, this server runs {server_model}")]
+    ModelMismatch {
+        /// The map.
+        map: MapName,
+        /// What it is bound to.
+        map_model: ModelId,
+        /// What is loaded.
+        server_model: ModelId,
+    },
+    /// The external id already names another image.
+    #[error("external id {external_id} of map {map} belongs to another image")]
+    ExternalIdConflict {
+        /// The map.
+        map: MapName,
+        /// The id.
+        external_id: ExternalId,
+    },
+    /// The queue is full.
+    #[error("{waiting} requests are waiting or being computed, as many as allowed")]
+    Overloaded {
+        /// Requests in the queue.
+        waiting: usize,
+        /// When a place is likely to be free.
+        retry_after: Duration,
+    },
+    /// Resident memory is above the watermark.
+    #[error(transparent)]
+    MemoryPressure(#[from] crate::ops::memory::MemoryShort),
+    /// The disk is almost full; the rest is kept for deletions.
+    #[error("the disk that holds the store is full")]
+    DiskFull,
+    /// The deadline passed before any answer was ready.
+    #[error("the deadline passed before {stage} was done")]
+    DeadlineExceeded {
+        /// The stage that was not reached or finished.
+        stage: &'static str,
+    },
+    /// The server is stopping.
+    #[error("the server is stopping")]
+    ShuttingDown,
+    /// A stage broke; the process goes on.
+    #[error("{stage} failed unexpectedly")]
+    Panicked {
+        /// Which stage.
+        stage: &'static str,
+    },
+}
+
+impl PipelineError {
+    /// The row of the error table.
+    pub fn code(&self) -> ErrorCode {
+        match self {
+            Self::Image(error) => error.code(),
+            Self::DecoderPanicked => ErrorCode::ImageUndecodable,
+            Self::Extract(error) => error.code(),
+            Self::Store(error) => error.code(),
+            Self::Invalid(_) => ErrorCode::InvalidParameter,
+            Self::MapNotFound(_) => ErrorCode::MapNotFound,
+            Self::ModelMismatch { .. } => ErrorCode::ModelMismatch,
+            Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
+            Self::Overloaded { .. } => ErrorCode::Overloaded,
+            Self::MemoryPressure(_) => ErrorCode::MemoryPressure,
+            Self::DiskFull => ErrorCode::DiskFull,
+            Self::DeadlineExceeded { .. } => ErrorCode::DeadlineExceeded,
+            Self::ShuttingDown => ErrorCode::ShuttingDown,
+            Self::Panicked { .. } => ErrorCode::Internal,
+        }
+    }
+
+    /// When trying again is likely to help, where that is known.
+    pub fn retry_after(&self) -> Option<Duration> {
+        match self {
+            Self::Overloaded { retry_after, .. } => Some(*retry_after),
+            _ => None,
+        }
+    }
+}

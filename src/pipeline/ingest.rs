@@ -1,0 +1,138 @@
+//! Image and metadata to a durable, searchable reference.
+
+use super::blocking::blocking;
+use super::{PipelineError, Service, Timings};
+use crate::error::ErrorCode;
+use crate::ops::Stage;
+use crate::ops::metrics::Rejection;
+use crate::search::IndexEntry;
+use crate::store::Inserted;
+use crate::types::{ContentHash, InvalidValue, MapName, NewReference, Reference, ReferenceFields};
+use bytes::Bytes;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// A reference to be taken in.
+#[derive(Debug, Clone)]
+pub struct IngestRequest {
+    /// Its map; created on first use.
+    pub map: MapName,
+    /// What the map builder says about it.
+    pub fields: ReferenceFields,
+    /// The photo, as it was sent.
+    pub image: Bytes,
+}
+
+/// A reference that is durable and can be found.
+#[derive(Debug, Clone)]
+pub struct IngestAnswer {
+    /// The reference.
+    pub reference: Reference,
+    /// False if the same external id with the same content was there before.
+    pub created: bool,
+    /// Where the time went.
+    pub timings: Timings,
+}
+
+impl Service {
+    /// Takes in one reference; returns once it is fsynced and in the index.
+    ///
+    /// Cancel safety: dropped before the commit began, nothing is stored; dropped later, the reference is stored and
+    /// indexed all the same, and repeating the request with its external id finds it.
+    pub async fn ingest(self: &Arc<Self>, request: IngestRequest) -> Result<IngestAnswer, PipelineError> {
+        self.may_store()?;
+        self.check_metadata(&request.fields)?;
+        let model = self.extraction.source().model_id().clone();
+        if let Some(live) = self.maps.live(&request.map) {
+            live.check_model(&request.map, &model)?;
+        }
+        let content_hash = self.hash(request.image.clone()).await?;
+        if let Some(reference) = self.known(&request, content_hash).await? {
+            return Ok(IngestAnswer { reference, created: false, timings: Timings::default() });
+        }
+        let _ticket = self.admission.enter()?;
+        let mut timings = Timings::default();
+        let descriptor = self.extraction.describe(request.image, None, &mut timings).await?;
+        let new = NewReference { map: request.map, fields: request.fields, content_hash, model, descriptor };
+        let (service, started) = (self.clone(), Instant::now());
+        let committed = blocking(move || service.commit(new)).await;
+        timings.record(&self.metrics, Stage::Commit, started.elapsed());
+        let inserted = committed.map_err(|_| PipelineError::Panicked { stage: "the store" })??;
+        let (reference, created) = match inserted {
+            Inserted::Created(reference) => (reference, true),
+            Inserted::AlreadyThere(reference) => (reference, false),
+        };
+        Ok(IngestAnswer { reference, created, timings })
+    }
+
+    /// Refuses while disk or memory is short. Deleting is never refused.
+    pub fn may_store(&self) -> Result<(), PipelineError> {
+        if self.health.is_draining() {
+            self.metrics.rejected(Rejection::Draining);
+            return Err(PipelineError::ShuttingDown);
+        }
+        if self.health.is_disk_full() {
+            self.metrics.rejected(Rejection::DiskFull);
+            return Err(PipelineError::DiskFull);
+        }
+        self.memory.check().inspect_err(|_| self.metrics.rejected(Rejection::MemoryPressure))?;
+        Ok(())
+    }
+
+    /// Bounds the metadata of a reference.
+    pub(super) fn check_metadata(&self, fields: &ReferenceFields) -> Result<(), PipelineError> {
+        let Some(metadata) = &fields.metadata else { return Ok(()) };
+        let length = serde_json::to_vec(metadata).map_or(usize::MAX, |text| text.len());
+        let bound = self.config.max_metadata_bytes;
+        if length > bound {
+            let reason = format!("{length} bytes of JSON are more than the {bound} allowed");
+            return Err(InvalidValue::new("metadata", reason).into());
+        }
+        Ok(())
+    }
+
+    async fn hash(&self, image: Bytes) -> Result<ContentHash, PipelineError> {
+        let hashed = blocking(move || ContentHash::of(&image)).await;
+        hashed.map_err(|_| PipelineError::Panicked { stage: "hashing" })
+    }
+
+    /// The reference that this request repeats, found before anything costly; a conflict if it is another image.
+    async fn known(
+        self: &Arc<Self>,
+        request: &IngestRequest,
+        content_hash: ContentHash,
+    ) -> Result<Option<Reference>, PipelineError> {
+        let Some(external_id) = request.fields.external_id.clone() else { return Ok(None) };
+        match self.find_external(request.map.clone(), external_id.clone()).await {
+            Ok(Some(reference)) if reference.content_hash == content_hash => Ok(Some(reference)),
+            Ok(Some(_)) => Err(PipelineError::ExternalIdConflict { map: request.map.clone(), external_id }),
+            Ok(None) => Ok(None),
+            // The map is made by this very request.
+            Err(error) if error.code() == ErrorCode::MapNotFound => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    fn commit(&self, new: NewReference) -> Result<Inserted, PipelineError> {
+        let entry = self.maps.entry(&new.map);
+        let _inserting = entry.inserting();
+        let model = new.model.clone();
+        let (global, patch_bytes) = (new.descriptor.global.clone(), new.descriptor.patches.heap_bytes());
+        let inserted = self.store.insert(new).inspect_err(|error| {
+            if error.code() == ErrorCode::DiskFull {
+                self.health.set_disk_full(true);
+                self.metrics.rejected(Rejection::DiskFull);
+            }
+        })?;
+        if let Inserted::Created(reference) = &inserted {
+            self.metrics.stored_descriptor(global.len() * size_of::<f32>(), patch_bytes);
+            entry.live_or_create(&model).index.insert(IndexEntry {
+                id: reference.id,
+                global,
+                location: reference.fields.location,
+                captured_at: reference.fields.captured_at,
+            });
+        }
+        Ok(inserted)
+    }
+}

@@ -1,0 +1,89 @@
+//! Two images, or an image and a reference, matched with the evidence kept.
+
+use super::blocking::blocking;
+use super::{PipelineError, Service, Timings};
+use crate::ops::Stage;
+use crate::rerank::CombinationMatch;
+use crate::types::{Deadline, ImageSize, MapName, ModelId, PackedPatches, ReferenceId};
+use bytes::Bytes;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// The second side of a match.
+#[derive(Debug, Clone)]
+pub enum MatchSide {
+    /// An image, as it was sent.
+    Image(Bytes),
+    /// A stored reference.
+    Reference(ReferenceId),
+}
+
+/// Everything about one pair.
+#[derive(Debug, Clone)]
+pub struct Matched {
+    /// Key patches of the query.
+    pub query: Arc<PackedPatches>,
+    /// Key patches of the reference.
+    pub reference: Arc<PackedPatches>,
+    /// One entry per configured scale combination.
+    pub combinations: Vec<CombinationMatch>,
+}
+
+/// A matched pair with how it came about.
+#[derive(Debug, Clone)]
+pub struct MatchAnswer {
+    /// The pair.
+    pub matched: Matched,
+    /// The size that pixel positions refer to.
+    pub input_size: ImageSize,
+    /// Where the time went.
+    pub timings: Timings,
+    /// What computed it.
+    pub model: ModelId,
+}
+
+impl Service {
+    /// Matches an image against another one or against a reference.
+    ///
+    /// Cancel safety: dropped while waiting, nothing further is computed.
+    pub async fn match_images(self: &Arc<Self>, query: Bytes, other: MatchSide) -> Result<MatchAnswer, PipelineError> {
+        let stored = match &other {
+            MatchSide::Reference(id) => Some(self.stored_patches(*id).await?),
+            MatchSide::Image(_) => None,
+        };
+        let _ticket = self.admission.enter()?;
+        let deadline = Some(Deadline::after(Duration::from_millis(self.config.deadline_ms)));
+        let mut timings = Timings::default();
+        let query = Arc::new(self.extraction.describe(query, deadline, &mut timings).await?.patches);
+        let reference = match (stored, other) {
+            (Some(patches), _) => patches,
+            (None, MatchSide::Image(bytes)) => {
+                Arc::new(self.extraction.describe(bytes, deadline, &mut timings).await?.patches)
+            }
+            (None, MatchSide::Reference(id)) => self.stored_patches(id).await?,
+        };
+        let (service, started) = (self.clone(), Instant::now());
+        let explained = blocking(move || {
+            let combinations = service.reranker.explain(&query, &reference);
+            Matched { query, reference, combinations }
+        })
+        .await;
+        timings.record(&self.metrics, Stage::Rerank, started.elapsed());
+        let source = self.extraction.source();
+        Ok(MatchAnswer {
+            matched: explained.map_err(|_| PipelineError::Panicked { stage: "matching" })?,
+            input_size: source.input_size(),
+            timings,
+            model: source.model_id().clone(),
+        })
+    }
+
+    async fn stored_patches(self: &Arc<Self>, id: ReferenceId) -> Result<Arc<PackedPatches>, PipelineError> {
+        let reference = self.reference(id).await?;
+        let map: MapName = reference.map;
+        self.maps.comparable(&map, self.extraction.source().model_id())?;
+        let service = self.clone();
+        let loaded = blocking(move || service.patches.load(&*service.store, id)).await;
+        Ok(loaded.map_err(|_| PipelineError::Panicked { stage: "the store" })??)
+    }
+}

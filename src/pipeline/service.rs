@@ -1,0 +1,125 @@
+//! The service: everything a request needs, and the questions that need no image.
+
+use super::admission::Admission;
+use super::blocking::blocking;
+use super::extraction::Extraction;
+use super::maps::Maps;
+use super::patches::PatchCache;
+use super::{PipelineConfig, PipelineError};
+use crate::ops::memory::MemoryWatermark;
+use crate::ops::metrics::MemoryComponent;
+use crate::ops::{Health, Metrics};
+use crate::rerank::{RerankConfig, Reranker};
+use crate::store::{MapInfo, Page, PlaceStore, StoreError};
+use crate::types::{ExternalId, ImageSize, MapName, ModelId, Reference, ReferenceId};
+use std::sync::Arc;
+
+/// A running service. Shared behind an `Arc`; every method may be called from many tasks at once.
+pub struct Service {
+    pub(super) store: Arc<dyn PlaceStore>,
+    pub(super) extraction: Extraction,
+    pub(super) reranker: Reranker,
+    pub(super) rerank_config: RerankConfig,
+    pub(super) maps: Maps,
+    pub(super) patches: PatchCache,
+    pub(super) admission: Arc<Admission>,
+    pub(super) memory: MemoryWatermark,
+    pub(super) config: PipelineConfig,
+    pub(super) metrics: Arc<Metrics>,
+    pub(super) health: Arc<Health>,
+}
+
+/// What this server computes with.
+#[derive(Debug, Clone)]
+pub struct ServiceInfo {
+    /// Its model.
+    pub model: ModelId,
+    /// The size images are resized to.
+    pub input_size: ImageSize,
+    /// How candidates are re-ranked.
+    pub rerank: RerankConfig,
+    /// Defaults and bounds of requests.
+    pub pipeline: PipelineConfig,
+}
+
+impl Service {
+    /// What this server computes with.
+    pub fn info(&self) -> ServiceInfo {
+        ServiceInfo {
+            model: self.extraction.source().model_id().clone(),
+            input_size: self.extraction.source().input_size(),
+            rerank: self.rerank_config.clone(),
+            pipeline: self.config.clone(),
+        }
+    }
+
+    /// Settings of the composition.
+    pub fn config(&self) -> &PipelineConfig {
+        &self.config
+    }
+
+    /// One reference's metadata.
+    pub async fn reference(self: &Arc<Self>, id: ReferenceId) -> Result<Reference, PipelineError> {
+        self.read(move |store| store.get(id)).await
+    }
+
+    /// The reference that a map builder named so, if there is one.
+    pub async fn find_external(
+        self: &Arc<Self>,
+        map: MapName,
+        external_id: ExternalId,
+    ) -> Result<Option<Reference>, PipelineError> {
+        self.read(move |store| store.find_external(&map, &external_id)).await
+    }
+
+    /// A page of references, ascending by id.
+    pub async fn references(
+        self: &Arc<Self>,
+        map: Option<MapName>,
+        after: Option<ReferenceId>,
+        limit: usize,
+    ) -> Result<Page, PipelineError> {
+        self.read(move |store| {
+            if let Some(map) = &map {
+                store.map(map)?;
+            }
+            store.list(map.as_ref(), after, limit)
+        })
+        .await
+    }
+
+    /// All maps by name.
+    pub async fn maps(self: &Arc<Self>) -> Result<Vec<MapInfo>, PipelineError> {
+        self.read(|store| store.maps()).await
+    }
+
+    /// One map.
+    pub async fn map(self: &Arc<Self>, name: MapName) -> Result<MapInfo, PipelineError> {
+        self.read(move |store| store.map(&name)).await
+    }
+
+    /// Brings the gauges up to date, before they are read.
+    pub async fn observe(self: &Arc<Self>) {
+        let maps = self.maps.all();
+        let index: usize = maps.iter().map(|(_, live)| live.index.memory_bytes()).sum();
+        self.metrics.set_memory(MemoryComponent::Index, index as u64);
+        self.metrics.set_memory(MemoryComponent::Cache, self.patches.bytes());
+        self.metrics.set_memory(MemoryComponent::Model, self.extraction.source().memory_bytes());
+        self.metrics
+            .set_references(maps.iter().map(|(name, live)| (name.to_string(), live.index.len() as u64)).collect());
+        self.metrics.set_queue_depth(self.admission.depth());
+        match self.read(|store| store.footprint()).await {
+            Ok((_, engine)) => self.metrics.set_memory(MemoryComponent::Sqlite, engine),
+            Err(error) => tracing::warn!(%error, "the store's footprint could not be read"),
+        }
+    }
+
+    pub(super) async fn read<T: Send + 'static>(
+        self: &Arc<Self>,
+        work: impl FnOnce(&dyn PlaceStore) -> Result<T, StoreError> + Send + 'static,
+    ) -> Result<T, PipelineError> {
+        let service = self.clone();
+        let outcome = blocking(move || work(&*service.store)).await;
+        Ok(outcome.map_err(|_| PipelineError::Panicked { stage: "the store" })??)
+    }
+}

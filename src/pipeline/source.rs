@@ -1,0 +1,32 @@
+//! The seam between the pipeline and the model, so that tests of the service need no weights.
+
+use crate::extract::{ExtractError, Extractor};
+use crate::types::{Descriptor, ImageSize, ImageTensor, ModelId};
+
+/// What turns images into descriptors. Production uses [`Extractor`].
+pub trait DescriptorSource: Send + Sync + 'static {
+    /// What its descriptors may be compared with.
+    fn model_id(&self) -> &ModelId;
+    /// The size images must be resized to.
+    fn input_size(&self) -> ImageSize;
+    /// One descriptor per image. Blocks for the whole computation.
+    fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError>;
+    /// Bytes of weights in memory.
+    fn memory_bytes(&self) -> u64 {
+        0
+    }
+}
+
+impl DescriptorSource for Extractor {
+    fn model_id(&self) -> &ModelId {
+        Extractor::model_id(self)
+    }
+
+    fn input_size(&self) -> ImageSize {
+        Extractor::input_size(self)
+    }
+
+    fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
+        self.extract(images)
+    }
+}
