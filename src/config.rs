@@ -139,6 +139,7 @@ impl Config {
         self.http.check()?;
         self.auth.check()?;
         self.pipeline.check()?;
+        self.extract.encoder_spec()?;
         self.log.check()?;
         Ok(())
     }
@@ -153,10 +154,10 @@ impl Config {
             let _ = write!(text, "\n[{section}]\n");
             for (key, value) in keys.as_table().into_iter().flatten() {
                 let comment = described.iter().find(|(name, _)| name == key).map_or("", |(_, comment)| comment);
-                let _ = write!(text, "{}{key} = {value}\n", commented(comment));
+                let _ = writeln!(text, "{}{key} = {value}", commented(comment));
             }
             for (key, comment) in described.iter().filter(|(key, _)| keys.get(key).is_none()) {
-                let _ = write!(text, "{}# {key} =\n", commented(comment));
+                let _ = writeln!(text, "{}# {key} =", commented(comment));
             }
         }
         Ok(text)

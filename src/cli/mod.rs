@@ -1,6 +1,7 @@
 //! The command line: one file per subcommand.
 
 pub mod bench;
+mod client;
 pub mod demo;
 pub mod eval;
 pub mod extract;
@@ -72,6 +73,8 @@ pub enum Command {
 impl Cli {
     /// Runs the subcommand to its end.
     pub fn run(self) -> anyhow::Result<()> {
+        // Fails only if one is installed already, which is as good.
+        let _ = rustls::crypto::ring::default_provider().install_default();
         match self.command {
             Command::Serve(args) => serve::run(args),
             Command::Import(args) => import::run(args),

@@ -22,10 +22,7 @@ pub(super) const SECTIONS: &[(&str, Keys)] = &[
         &[
             ("listen", "Address and port; port 0 picks a free one."),
             ("max_connections", "Connections open at once; further ones wait in the kernel's backlog."),
-            (
-                "header_timeout_ms",
-                "Time for a request's head to arrive, also between two requests of one connection.",
-            ),
+            ("header_timeout_ms", "Time for a request's head to arrive, also between two requests of one connection."),
             ("body_timeout_ms", "Time for a whole body to arrive."),
             ("body_idle_timeout_ms", "Longest pause within a body."),
             ("max_header_bytes", "Largest head of a request."),
@@ -81,7 +78,22 @@ pub(super) const SECTIONS: &[(&str, Keys)] = &[
             ("max_pixels", "Most pixels."),
         ],
     ),
-    ("extract", &[]),
+    (
+        "extract",
+        &[
+            ("preset", "The backbone: dinov2-vits14, dinov2-vitb14, dinov2-vitl14 or placeformer-vits16."),
+            ("input_size", "Images are squashed to this, each side a multiple of the patch size; the preset's own."),
+            ("exit_block", "0-based block whose tokens are used; later ones are not computed; the preset's own."),
+            ("token_norm", "Whether the tokens pass the final LayerNorm; the preset's own."),
+            ("attention_block", "0-based block whose CLS attention ranks patches; the exit block."),
+            ("heads", "Attention heads, for weights trained with another count than the preset's."),
+            ("tau", "Key patches must exceed this multiple of the uniform attention; 1 is the paper's 0.01."),
+            ("caps", "Most key patches at scales 1, 2 and 3."),
+            ("stride", "Distance between fused windows: \"kernel\" (no overlap) or \"one\" (every patch)."),
+            ("head", "Projection to the global descriptor: \"default\" or a file."),
+            ("precision", "Arithmetic of the linear layers."),
+        ],
+    ),
     (
         "rerank",
         &[

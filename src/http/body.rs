@@ -136,9 +136,13 @@ async fn read_bytes(state: &AppState, request: Request, limit: usize) -> Result<
     }
 }
 
-type Parts = (HashMap<&'static str, Bytes>, Option<Map<String, Value>>);
+type Images = HashMap<&'static str, Bytes>;
 
-async fn split_multipart(headers: HeaderMap, bytes: Bytes, names: &'static [&'static str]) -> Result<Parts, ApiError> {
+async fn split_multipart(
+    headers: HeaderMap,
+    bytes: Bytes,
+    names: &'static [&'static str],
+) -> Result<(Images, Option<Map<String, Value>>), ApiError> {
     let mut request = Request::new(Body::from(bytes));
     *request.headers_mut() = headers;
     axum::extract::DefaultBodyLimit::disable().apply(&mut request);
@@ -163,10 +167,7 @@ async fn split_multipart(headers: HeaderMap, bytes: Bytes, names: &'static [&'st
     Ok((images, json))
 }
 
-fn split_json(
-    bytes: &[u8],
-    names: &'static [&'static str],
-) -> Result<(HashMap<&'static str, Bytes>, Map<String, Value>), ApiError> {
+fn split_json(bytes: &[u8], names: &'static [&'static str]) -> Result<(Images, Map<String, Value>), ApiError> {
     let mut json: Map<String, Value> = serde_json::from_slice(bytes).map_err(json_error)?;
     let mut images = HashMap::new();
     for &name in names {

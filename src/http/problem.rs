@@ -151,10 +151,15 @@ fn status_of(code: ErrorCode) -> StatusCode {
     StatusCode::from_u16(code.status()).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR)
 }
 
+/// Marks an error response that has its own documented body, so that it is left as it is.
+#[derive(Debug, Clone, Copy)]
+pub struct OwnBody;
+
 /// Gives an error response its body; leaves every other response alone.
 pub fn finish(response: Response, request_id: &str) -> Response {
     let status = response.status();
-    if !status.is_client_error() && !status.is_server_error() {
+    let is_error = status.is_client_error() || status.is_server_error();
+    if !is_error || response.extensions().get::<OwnBody>().is_some() {
         return response;
     }
     let (mut parts, _) = response.into_parts();

@@ -2,12 +2,12 @@
 
 use crate::error::ErrorCode;
 use crate::http::AppState;
-use crate::http::problem::ApiError;
+use crate::http::problem::{ApiError, OwnBody};
 use crate::ops::{Metrics, Unready};
-use axum::Json;
 use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use serde::Serialize;
 use utoipa::ToSchema;
 
@@ -63,7 +63,8 @@ pub async fn readyz(State(state): State<AppState>) -> Response {
         Unready::BuildingIndex { done, total } => Some(ProgressBody { done, total }),
         _ => None,
     };
-    (StatusCode::SERVICE_UNAVAILABLE, Json(ReadyBody { status: reason.as_str(), progress })).into_response()
+    let body = Json(ReadyBody { status: reason.as_str(), progress });
+    (StatusCode::SERVICE_UNAVAILABLE, Extension(OwnBody), [(header::RETRY_AFTER, "1")], body).into_response()
 }
 
 /// Metrics for Prometheus
