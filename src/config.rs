@@ -13,6 +13,7 @@ use crate::image::ImageConfig;
 use crate::ops::LogConfig;
 use crate::pipeline::PipelineConfig;
 use crate::rerank::RerankConfig;
+use crate::store::StoreConfig;
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
@@ -28,12 +29,14 @@ const PREFIX: &str = "PLACEFORMER_";
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// Where the store lives.
-    pub store: StoreLocation,
+    /// Where the data lives.
+    pub data: DataLocation,
     /// Connections, bodies, draining.
     pub http: HttpConfig,
     /// Keys and paces.
     pub auth: AuthConfig,
+    /// The database.
+    pub store: StoreConfig,
     /// Queue, cache, defaults of queries, watermarks.
     pub pipeline: PipelineConfig,
     /// Limits of images.
@@ -46,17 +49,17 @@ pub struct Config {
     pub log: LogConfig,
 }
 
-/// Where the store lives.
+/// Where the data lives.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct StoreLocation {
+pub struct DataLocation {
     /// Directory of the store; made if it is not there.
-    pub data: PathBuf,
+    pub directory: PathBuf,
 }
 
-impl Default for StoreLocation {
+impl Default for DataLocation {
     fn default() -> Self {
-        Self { data: PathBuf::from("placeformer-data") }
+        Self { directory: PathBuf::from("placeformer-data") }
     }
 }
 
@@ -130,7 +133,7 @@ impl Config {
     fn apply(&mut self, overrides: &Overrides) {
         let Overrides { listen, data, log_format, log } = overrides.clone();
         self.http.listen = listen.unwrap_or_else(|| std::mem::take(&mut self.http.listen));
-        self.store.data = data.unwrap_or_else(|| std::mem::take(&mut self.store.data));
+        self.data.directory = data.unwrap_or_else(|| std::mem::take(&mut self.data.directory));
         self.log.format = log_format.unwrap_or(self.log.format);
         self.log.filter = log.unwrap_or_else(|| std::mem::take(&mut self.log.filter));
     }

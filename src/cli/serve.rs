@@ -8,7 +8,7 @@ use crate::extract::Extractor;
 use crate::http::{AppState, serve};
 use crate::ops::{Health, Metrics, disk, logging, shutdown};
 use crate::pipeline::{DescriptorSource, Parts, Service};
-use crate::store::PlaceStore;
+use crate::store::{PlaceStore, SqliteStore, StoreConfig};
 use anyhow::{Context, anyhow};
 use std::future::Future;
 use std::path::{Path, PathBuf};
@@ -70,18 +70,20 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
 }
 
 fn loaders(config: &Config) -> Loaders {
-    let (extract, data) = (config.extract.clone(), config.store.data.clone());
+    let (extract, data, store) = (config.extract.clone(), config.data.directory.clone(), config.store.clone());
     Loaders {
         source: Box::new(move || {
-            let weights = std::env::var_os("PLACEFORMER_WEIGHTS").context("no weights")?;
+            let weights = std::env::var_os("PLACEFORMER_WEIGHTS").context("PLACEFORMER_WEIGHTS names no file")?;
             Ok(Arc::new(Extractor::load(&extract, Path::new(&weights), None)?))
         }),
-        store: Box::new(move || open_store(&data)),
+        store: Box::new(move || open_store(&data, &store)),
     }
 }
 
-pub(super) fn open_store(data: &Path) -> anyhow::Result<Arc<dyn PlaceStore>> {
-    anyhow::bail!("cannot open the store in {}: no store is built in yet", data.display())
+pub(super) fn open_store(data: &Path, config: &StoreConfig) -> anyhow::Result<Arc<dyn PlaceStore>> {
+    let store =
+        SqliteStore::open(data, config).with_context(|| format!("cannot open the store in {}", data.display()))?;
+    Ok(Arc::new(store))
 }
 
 /// Serves on `listener` until `shutdown` resolves and all is drained, or start-up fails.
@@ -128,7 +130,7 @@ async fn open(state: AppState, config: Config, loaders: Loaders) -> anyhow::Resu
 /// Keeps `disk_full` true to the disk.
 async fn watch_disk(config: Config, health: Arc<Health>) {
     loop {
-        let (data, reserve) = (config.store.data.clone(), config.pipeline.disk_reserve_bytes);
+        let (data, reserve) = (config.data.directory.clone(), config.pipeline.disk_reserve_bytes);
         if let Ok(Ok(space)) = spawn_blocking(move || disk::space(&data)).await {
             health.set_disk_full(space.is_short_of(reserve));
         }

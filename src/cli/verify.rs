@@ -1,5 +1,6 @@
 //! Check every record of a store.
 
+use crate::store::StoreConfig;
 use anyhow::{Context, ensure};
 use std::path::PathBuf;
 
@@ -17,7 +18,7 @@ pub struct VerifyArgs {
 /// Reads everything, quarantines what is damaged, and fails if anything was.
 pub fn run(args: VerifyArgs) -> anyhow::Result<()> {
     ensure!(args.data.is_dir(), "there is no store in {}", args.data.display());
-    let store = super::serve::open_store(&args.data)?;
+    let store = super::serve::open_store(&args.data, &StoreConfig::default())?;
     let report = store.verify().context("the store cannot be read")?;
     if args.json {
         let damaged: Vec<_> =

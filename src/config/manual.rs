@@ -16,7 +16,18 @@ pub(super) fn section(name: &str) -> Keys {
 
 /// All sections.
 pub(super) const SECTIONS: &[(&str, Keys)] = &[
-    ("store", &[("data", "Directory of the store; made if it is not there. One process at a time.")]),
+    ("data", &[("directory", "Directory of the store; made if it is not there. One process at a time.")]),
+    (
+        "store",
+        &[
+            ("readers", "Most reading connections open at once; further readers wait."),
+            ("cache_kib", "Page cache of each connection; patches come through the system's cache."),
+            ("page_bytes", "Size of a database page, a power of two from 4096 to 65536; fixed at creation."),
+            ("log_bytes", "Size of the write-ahead log at which it is folded into the database."),
+            ("reserve_bytes", "Room kept so that deletes succeed on a full disk (at most a quarter of what is left)."),
+            ("queue", "Writes that may wait for the writer; further ones block their caller."),
+        ],
+    ),
     (
         "http",
         &[

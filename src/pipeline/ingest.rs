@@ -107,8 +107,8 @@ impl Service {
             Ok(Some(reference)) if reference.content_hash == content_hash => Ok(Some(reference)),
             Ok(Some(_)) => Err(PipelineError::ExternalIdConflict { map: request.map.clone(), external_id }),
             Ok(None) => Ok(None),
-            // The map is made by this very request.
-            Err(error) if error.code() == ErrorCode::MapNotFound => Ok(None),
+            // The map is made by this very request; or the record is damaged, and this image may replace it.
+            Err(error) if matches!(error.code(), ErrorCode::MapNotFound | ErrorCode::CorruptRecord) => Ok(None),
             Err(error) => Err(error),
         }
     }
