@@ -2,6 +2,7 @@
 //!
 //! | module | holds |
 //! |---|---|
+//! | [`scan`] | dot products of one int8 vector with many, for the search |
 //! | [`simd`] | which instructions may be used: chosen once at start, or forced by `PLACEFORMER_SIMD` |
 //! | [`homography`] | four-point homographies and inlier counts, in vectors |
 //! | [`similarity`] | best partners among int8 descriptors: running row and column maxima |
@@ -12,6 +13,7 @@
 
 #[allow(clippy::needless_range_loop, reason = "lanes, corners and halves index several arrays at once")]
 pub mod homography;
+pub mod scan;
 pub mod simd;
 #[allow(clippy::needless_range_loop, reason = "sections and halves index several arrays at once")]
 pub mod similarity;
@@ -22,7 +24,8 @@ pub use simd::{Simd, SimdError, SimdLevel};
 type Check = fn(Simd) -> Result<(), String>;
 
 /// Every kernel's check, by the kernel's name.
-const CHECKS: &[(&str, Check)] = &[("homography", homography::check), ("similarity", similarity::check)];
+const CHECKS: &[(&str, Check)] =
+    &[("homography", homography::check), ("scan", scan::check), ("similarity", similarity::check)];
 
 /// Chooses the level and compares every kernel at it with its scalar twin (a few milliseconds). Programs call this
 /// once at start.

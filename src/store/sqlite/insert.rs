@@ -79,7 +79,7 @@ pub(super) fn insert(connection: &Connection, new: &Prepared) -> Result<(Inserte
     if let Some(external_id) = &new.fields.external_id {
         match holder(connection, &map, external_id, new.content_hash)? {
             Holder::Nobody => {}
-            Holder::SameContent(existing) => return Ok((Inserted::AlreadyThere(existing), None)),
+            Holder::SameContent(existing) => return Ok((Inserted::AlreadyThere(*existing), None)),
             Holder::Removed(number) => healed = Some(number),
         }
     }
@@ -126,7 +126,7 @@ fn create_map(connection: &Connection, name: &MapName, model: &ModelId) -> Resul
 /// Who has an external id.
 enum Holder {
     Nobody,
-    SameContent(Reference),
+    SameContent(Box<Reference>),
     /// It was damaged and is removed: sending its image again is how a map is healed.
     Removed(i64),
 }
@@ -148,7 +148,7 @@ fn holder(
         .map_err(&looking)?;
     match rows::reference_by_number(connection, number) {
         Ok(Some(existing)) if !quarantined && existing.content_hash == content_hash => {
-            Ok(Holder::SameContent(existing))
+            Ok(Holder::SameContent(Box::new(existing)))
         }
         Ok(Some(existing)) if !quarantined => Err(StoreError::ExternalIdConflict {
             map: map.name.clone(),
