@@ -42,6 +42,7 @@ fn weights() -> VitWeights {
             })
             .collect(),
         norm: norm(rng),
+        unused_parameters: 0,
     }
 }
 
