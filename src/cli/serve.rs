@@ -73,8 +73,8 @@ fn loaders(config: &Config) -> Loaders {
     let (extract, data, store) = (config.extract.clone(), config.data.directory.clone(), config.store.clone());
     Loaders {
         source: Box::new(move || {
-            let weights = std::env::var_os("PLACEFORMER_WEIGHTS").context("PLACEFORMER_WEIGHTS names no file")?;
-            Ok(Arc::new(Extractor::load(&extract, Path::new(&weights), None)?))
+            let weights = crate::extract::pull::resolve_model(extract.preset, false)?;
+            Ok(Arc::new(Extractor::load(&extract, &weights, None)?))
         }),
         store: Box::new(move || open_store(&data, &store)),
     }

@@ -1,0 +1,235 @@
+//! A whole service without weights: a real store in a temporary directory, the real surface, and a descriptor source
+//! that derives everything from the image's content.
+#![allow(dead_code, reason = "each test file uses its own part")]
+
+use axum::body::Body;
+use axum::http::{HeaderMap, Request, StatusCode};
+use axum::response::Response;
+use http_body_util::BodyExt;
+use placeformer::config::Config;
+use placeformer::extract::ExtractError;
+use placeformer::http::{AppState, app};
+use placeformer::ops::{Health, Metrics};
+use placeformer::pipeline::{DescriptorSource, Parts, Service};
+use placeformer::store::{SqliteStore, StoreConfig};
+use placeformer::types::{
+    Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid, PoolingStride,
+    ScaleKeyPatches,
+};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde_json::Value;
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+use tempfile::TempDir;
+use tower::ServiceExt;
+
+/// Size the fake model asks for.
+pub const SIZE: ImageSize = ImageSize { width: 112, height: 84 };
+
+/// Descriptors from content alone: equal images are equal, different ones as unrelated as random vectors.
+pub struct FakeSource {
+    model: ModelId,
+    /// Images described so far.
+    pub described: AtomicUsize,
+    delay: Mutex<Duration>,
+}
+
+impl FakeSource {
+    pub fn new(model: &str) -> Arc<Self> {
+        Arc::new(Self { model: ModelId::new(model), described: AtomicUsize::new(0), delay: Mutex::default() })
+    }
+
+    /// Lets every further description take this long.
+    pub fn slow_down(&self, delay: Duration) {
+        *self.delay.lock().unwrap() = delay;
+    }
+
+    pub fn described(&self) -> usize {
+        self.described.load(Ordering::SeqCst)
+    }
+}
+
+impl DescriptorSource for FakeSource {
+    fn model_id(&self) -> &ModelId {
+        &self.model
+    }
+
+    fn input_size(&self) -> ImageSize {
+        SIZE
+    }
+
+    fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
+        self.described.fetch_add(images.len(), Ordering::SeqCst);
+        let delay = *self.delay.lock().unwrap();
+        std::thread::sleep(delay);
+        Ok(images.iter().map(describe).collect())
+    }
+}
+
+fn describe(image: &ImageTensor) -> Descriptor {
+    let bytes: Vec<u8> = image.data.iter().flat_map(|value| value.to_le_bytes()).collect();
+    let mut rng = ChaCha8Rng::seed_from_u64(u64::from(crc32fast::hash(&bytes)));
+    let mut unit = |dim: usize| {
+        let raw: Vec<f32> = (0..dim).map(|_| rng.random_range(-1.0..1.0)).collect();
+        let norm = raw.iter().map(|v| v * v).sum::<f32>().sqrt();
+        raw.into_iter().map(|v| v / norm).collect::<Vec<f32>>()
+    };
+    let global = unit(GLOBAL_DIM);
+    let pooled = unit(384);
+    let grid = PatchGrid { columns: 8, rows: 6, patch_px: 14, stride: PoolingStride::Kernel };
+    let mut scale = |count: u32| ScaleKeyPatches {
+        index: (0..count).collect(),
+        attention: (0..count).map(|i| 2.0 - i as f32 / 100.0).collect(),
+        descriptors: (0..count).flat_map(|_| unit(384)).collect(),
+    };
+    let patches = KeyPatches { grid, dim: 384, scales: [scale(48), scale(12), scale(4)] };
+    Descriptor { global, pooled, patches: PackedPatches::quantise(&patches) }
+}
+
+/// A running application.
+pub struct App {
+    pub router: axum::Router,
+    pub state: AppState,
+    pub source: Arc<FakeSource>,
+    pub directory: Arc<TempDir>,
+}
+
+impl App {
+    pub fn new() -> Self {
+        Self::with(|_| {})
+    }
+
+    pub fn with(change: impl FnOnce(&mut Config)) -> Self {
+        Self::open(Arc::new(tempfile::tempdir().unwrap()), FakeSource::new("fake-1"), change)
+    }
+
+    pub fn open(directory: Arc<TempDir>, source: Arc<FakeSource>, change: impl FnOnce(&mut Config)) -> Self {
+        let mut config = Config::default();
+        config.store = StoreConfig { reserve_bytes: 1 << 20, ..Default::default() };
+        config.pipeline.disk_reserve_bytes = 0;
+        change(&mut config);
+        let (state, service) = open(directory.path(), source.clone(), config);
+        state.open(service);
+        Self { router: app(state.clone()), state, source, directory }
+    }
+
+    pub async fn send(&self, request: Request<Body>) -> Answer {
+        Answer::of(self.router.clone().oneshot(request).await.unwrap()).await
+    }
+
+    pub async fn get(&self, path: &str) -> Answer {
+        self.send(Request::get(path).body(Body::empty()).unwrap()).await
+    }
+
+    pub async fn delete(&self, path: &str) -> Answer {
+        self.send(Request::delete(path).body(Body::empty()).unwrap()).await
+    }
+
+    pub async fn post(&self, path: &str, kind: &str, body: impl Into<Body>) -> Answer {
+        self.send(Request::post(path).header("content-type", kind).body(body.into()).unwrap()).await
+    }
+
+    pub async fn post_png(&self, path: &str, seed: u64) -> Answer {
+        self.post(path, "image/png", picture(seed)).await
+    }
+
+    pub async fn patch(&self, path: &str, body: &Value) -> Answer {
+        let request = Request::patch(path).header("content-type", "application/json");
+        self.send(request.body(Body::from(body.to_string())).unwrap()).await
+    }
+
+    /// References over all maps, as the listing shows them.
+    pub async fn count(&self) -> usize {
+        self.get("/references?limit=1000").await.json["references"].as_array().unwrap().len()
+    }
+}
+
+/// The state of a server and its service, not yet opened.
+pub fn open(directory: &Path, source: Arc<dyn DescriptorSource>, config: Config) -> (AppState, Arc<Service>) {
+    let (metrics, health) = (Arc::new(Metrics::new().unwrap()), Arc::new(Health::default()));
+    let limit = config.image.max_bytes;
+    let state = AppState::new(config.http.clone(), &config.auth, limit, metrics.clone(), health.clone()).unwrap();
+    let store = Arc::new(SqliteStore::open(directory, &config.store).unwrap());
+    let Config { image, rerank, pipeline, .. } = config;
+    let service = Service::start(Parts { store, source, image, rerank, pipeline, metrics, health }).unwrap();
+    (state, service)
+}
+
+/// An answer read to its end.
+#[derive(Debug)]
+pub struct Answer {
+    pub status: StatusCode,
+    pub headers: HeaderMap,
+    pub text: String,
+    pub json: Value,
+}
+
+impl Answer {
+    pub async fn of(response: Response) -> Self {
+        let (parts, body) = response.into_parts();
+        let bytes = body.collect().await.unwrap().to_bytes();
+        let text = String::from_utf8_lossy(&bytes).into_owned();
+        let json = serde_json::from_str(&text).unwrap_or_default();
+        Self { status: parts.status, headers: parts.headers, text, json }
+    }
+
+    pub fn header(&self, name: &str) -> &str {
+        self.headers.get(name).map_or("", |value| value.to_str().unwrap())
+    }
+
+    /// Checks that this is the problem `code`, whole and from the table, and returns its detail.
+    #[track_caller]
+    pub fn problem(&self, code: &str) -> &str {
+        assert_eq!(self.json["code"], code, "{}", self.text);
+        let row = placeformer::error::ErrorCode::ALL.iter().find(|row| row.as_str() == code).unwrap();
+        assert_eq!(self.status.as_u16(), row.status());
+        assert_eq!(self.json["status"], row.status());
+        assert_eq!(self.json["title"], row.title());
+        assert_eq!(self.json["retryable"], row.retryable());
+        assert_eq!(self.header("content-type"), "application/problem+json");
+        assert_eq!(self.json["request_id"], self.header("x-request-id"));
+        assert_eq!(self.json["type"], format!("urn:placeformer:error:{code}"));
+        if [429, 503, 507].contains(&row.status()) {
+            assert!(self.header("retry-after").parse::<u64>().unwrap() >= 1);
+        }
+        self.json["detail"].as_str().unwrap()
+    }
+
+    #[track_caller]
+    pub fn ok(&self) -> &Value {
+        assert_eq!(self.status, StatusCode::OK, "{}", self.text);
+        &self.json
+    }
+
+    #[track_caller]
+    pub fn created(&self) -> &Value {
+        assert_eq!(self.status, StatusCode::CREATED, "{}", self.text);
+        &self.json
+    }
+}
+
+/// A PNG that no other seed gives.
+pub fn picture(seed: u64) -> Vec<u8> {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let pixels = image::RgbImage::from_fn(SIZE.width / 4, SIZE.height / 4, |_, _| image::Rgb(rng.random()));
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    pixels.write_to(&mut bytes, image::ImageFormat::Png).unwrap();
+    bytes.into_inner()
+}
+
+/// A multipart body of named parts, with its content type.
+pub fn multipart(parts: &[(&str, &[u8])]) -> (String, Vec<u8>) {
+    let boundary = "b0undary-of-the-test";
+    let mut body = Vec::new();
+    for (name, content) in parts {
+        let head = format!("--{boundary}\r\ncontent-disposition: form-data; name=\"{name}\"; filename=\"f\"\r\n\r\n");
+        body.extend_from_slice(head.as_bytes());
+        body.extend_from_slice(content);
+        body.extend_from_slice(b"\r\n");
+    }
+    body.extend_from_slice(format!("--{boundary}--\r\n").as_bytes());
+    (format!("multipart/form-data; boundary={boundary}"), body)
+}
