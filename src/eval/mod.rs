@@ -1,8 +1,16 @@
 //! Recall on data sets: readers, measures, reports.
 //!
-//! [`datasets`] turns the layouts people have into one shape; [`measure`] holds the numbers.
+//! [`datasets`] turns the layouts people have into one shape; [`features`] describes every image and keeps the result
+//! on disk; [`run`] searches and re-ranks as the service does; [`measure`] holds the numbers as pure functions;
+//! [`summary`] gathers them into one value, which [`report`] prints and draws.
+
 pub mod datasets;
 mod error;
+pub mod features;
 pub mod measure;
+pub mod prediction;
+pub mod report;
+pub mod run;
+pub mod summary;
 
 pub use error::EvalError;

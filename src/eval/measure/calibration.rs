@@ -6,6 +6,9 @@
 //! answers.
 
 use nalgebra::{Matrix3, Vector3};
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 /// A query's best answer with what is known about it.
@@ -98,6 +101,28 @@ pub fn fit(answers: &[TopOne], ridge: f64) -> Result<Calibration, CalibrationErr
     Ok(Calibration { bias: weights[0], score: weights[1], distance: weights[2] })
 }
 
+/// The penalty that suits hundreds to thousands of answers.
+pub const RIDGE: f64 = 1e-2;
+
+/// Confidence of every answer from a fit that has not seen it, with whether it was right. Each fold holds its share of
+/// right and of wrong answers; an answer whose other folds are one-sided is left out.
+pub fn cross_validate(answers: &[TopOne], ridge: f64, folds: usize, seed: u64) -> Vec<(f64, bool)> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let (mut right, mut wrong): (Vec<TopOne>, Vec<TopOne>) = answers.iter().partition(|answer| answer.correct);
+    right.shuffle(&mut random);
+    wrong.shuffle(&mut random);
+    let dealt: Vec<(usize, TopOne)> =
+        right.into_iter().chain(wrong).enumerate().map(|(i, answer)| (i % folds.max(2), answer)).collect();
+    let mut predictions = Vec::new();
+    for fold in 0..folds.max(2) {
+        let others: Vec<TopOne> = dealt.iter().filter(|(own, _)| *own != fold).map(|(_, answer)| *answer).collect();
+        let Ok(fitted) = fit(&others, ridge) else { continue };
+        let held_out = dealt.iter().filter(|(own, _)| *own == fold);
+        predictions.extend(held_out.map(|(_, a)| (fitted.confidence(a.spatial_score, a.global_distance), a.correct)));
+    }
+    predictions
+}
+
 /// One bin of confidence.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ReliabilityBin {
@@ -137,8 +162,7 @@ pub fn calibration_error(bins: &[ReliabilityBin]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rand::{RngExt, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
+    use rand::RngExt;
 
     #[test]
     fn planted_weights_are_recovered() {
@@ -158,6 +182,9 @@ mod tests {
         let predictions: Vec<_> =
             answers.iter().map(|a| (fitted.confidence(a.spatial_score, a.global_distance), a.correct)).collect();
         assert!(calibration_error(&reliability(&predictions)) < 0.02);
+        let unseen = cross_validate(&answers, 1e-3, 5, 1);
+        assert_eq!(unseen.len(), answers.len());
+        assert!(calibration_error(&reliability(&unseen)) < 0.02);
     }
 
     #[test]

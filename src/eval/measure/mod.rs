@@ -7,7 +7,9 @@ mod poses;
 mod ranking;
 mod rejection;
 
-pub use calibration::{Calibration, CalibrationError, ReliabilityBin, TopOne, calibration_error, fit, reliability};
+pub use calibration::{
+    Calibration, CalibrationError, RIDGE, ReliabilityBin, TopOne, calibration_error, cross_validate, fit, reliability,
+};
 pub use poses::{POSE_THRESHOLDS, PoseAccuracy, pose_accuracy};
 pub use ranking::{Interval, RECALL_AT, average_precision, bootstrap_recall, first_hit, recall_at};
 pub use rejection::{Judged, PrecisionRecall, Rejection, rejection};

@@ -1,0 +1,512 @@
+//! Descriptors of a whole data set, kept on disk so that an interrupted run resumes and a second one starts at once.
+//!
+//! A record is found by the model's identity and the hash of the image's content: renaming or copying images costs
+//! nothing, changing one image or one setting recomputes just what it must. Records are written beside their place
+//! and renamed into it, and carry a checksum: a half-written or damaged one is as good as none. An image that cannot
+//! be read is listed with its reason and takes no part; it never vanishes in silence.
+
+use super::EvalError;
+use super::datasets::Item;
+use crate::extract::Extractor;
+use crate::image::{ImageConfig, load_tensor};
+use crate::store::codec;
+use crate::types::{ContentHash, Descriptor, ImageTensor, ModelId, PackedPatches};
+use indicatif::ProgressBar;
+use quick_cache::Weighter;
+use quick_cache::sync::Cache;
+use rayon::prelude::*;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+/// What turns image bytes into descriptors.
+pub trait Describe: Sync {
+    /// Identity of everything the descriptors depend on.
+    fn model(&self) -> &ModelId;
+    /// Decodes and normalises; the error says what is wrong with the image.
+    fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String>;
+    /// One descriptor per image.
+    fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, EvalError>;
+}
+
+/// The model at work.
+pub struct ModelDescriber {
+    /// The model.
+    pub extractor: Extractor,
+    /// Limits on images.
+    pub limits: ImageConfig,
+}
+
+impl Describe for ModelDescriber {
+    fn model(&self) -> &ModelId {
+        self.extractor.model_id()
+    }
+
+    fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String> {
+        load_tensor(bytes, &self.limits, self.extractor.input_size()).map_err(|error| error.to_string())
+    }
+
+    fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, EvalError> {
+        Ok(self.extractor.extract(images)?)
+    }
+}
+
+/// Which vector is searched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum GlobalKind {
+    /// The global descriptor as the head makes it.
+    Head,
+    /// The mean patch token before the head.
+    Mean,
+}
+
+/// An image that could not be used.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Unreadable {
+    /// Its name in the data set.
+    pub name: String,
+    /// `database` or `query`.
+    pub side: &'static str,
+    /// Why.
+    pub reason: String,
+}
+
+/// Mean seconds per image of the stages before the search.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct ExtractionSeconds {
+    /// Decoding and resizing.
+    pub decode: f64,
+    /// The model.
+    pub extract: f64,
+}
+
+/// Descriptors of one side of a data set: global vectors in memory, key patches on disk behind a cache.
+pub struct Features {
+    /// Length of a global vector.
+    pub dim: usize,
+    /// Global vectors, `[n, dim]`; zeros where an image was unreadable.
+    pub globals: Vec<f32>,
+    /// Per image its record, or none where it was unreadable.
+    records: Vec<Option<ContentHash>>,
+    /// Mean bytes of an encoded patch blob.
+    pub patch_bytes: f64,
+    /// Mean length of the vector kept for another head.
+    pub pooled_dim: usize,
+    /// Images left out.
+    pub unreadable: Vec<Unreadable>,
+    /// What the records cost when they were made, whether in this run or an earlier one.
+    pub seconds: ExtractionSeconds,
+    /// Images described in this run; the others were cached.
+    pub fresh: usize,
+}
+
+impl Features {
+    #[cfg(test)]
+    pub(super) fn empty_for_tests(n: usize) -> Self {
+        let all = Collected { records: vec![None; n], ..Default::default() };
+        all.finish(n).unwrap()
+    }
+
+    /// Number of images, readable or not.
+    pub fn len(&self) -> usize {
+        self.records.len()
+    }
+
+    /// Whether there is no image at all.
+    pub fn is_empty(&self) -> bool {
+        self.records.is_empty()
+    }
+
+    /// The global vector of image `index`; none if it was unreadable.
+    pub fn global(&self, index: usize) -> Option<&[f32]> {
+        self.records[index].map(|_| &self.globals[index * self.dim..(index + 1) * self.dim])
+    }
+}
+
+/// The folder of records of one model, with recently used key patches in memory.
+pub struct FeatureCache {
+    folder: PathBuf,
+    memory: Cache<ContentHash, Arc<PackedPatches>, PatchBytes>,
+}
+
+#[derive(Clone)]
+struct PatchBytes;
+
+impl Weighter<ContentHash, Arc<PackedPatches>> for PatchBytes {
+    fn weight(&self, _key: &ContentHash, patches: &Arc<PackedPatches>) -> u64 {
+        patches.heap_bytes() as u64 + 64
+    }
+}
+
+/// Images decoded at a time, before they are described in batches: bounds the memory for pixels.
+const CHUNK: usize = 32;
+const BATCH: usize = 4;
+
+impl FeatureCache {
+    /// Opens (and creates) the records of `model` below `root`, holding at most `memory_bytes` of key patches.
+    pub fn open(root: &Path, model: &ModelId, memory_bytes: u64) -> Result<Self, EvalError> {
+        let name = ContentHash::of(model.as_str().as_bytes()).to_string();
+        let folder = root.join(&name[..16]);
+        std::fs::create_dir_all(&folder).map_err(EvalError::io(&folder))?;
+        let note = folder.join("model.txt");
+        std::fs::write(&note, model.as_str()).map_err(EvalError::io(&note))?;
+        Ok(Self { folder, memory: Cache::with_weighter(4096, memory_bytes, PatchBytes) })
+    }
+
+    /// Describes `items`, taking from disk what is there.
+    pub fn describe_all(
+        &self,
+        describer: &dyn Describe,
+        items: &[Item],
+        side: &'static str,
+        kind: GlobalKind,
+        progress: &ProgressBar,
+    ) -> Result<Features, EvalError> {
+        let mut all = Collected::default();
+        for chunk in items.chunks(CHUNK) {
+            let mut found: Vec<Result<Loaded, String>> =
+                chunk.par_iter().map(|item| self.find(describer, item)).collect();
+            self.describe_missing(describer, &mut found, &mut all.fresh)?;
+            for (item, result) in chunk.iter().zip(found) {
+                all.add(item, side, kind, result)?;
+            }
+            progress.inc(chunk.len() as u64);
+        }
+        all.finish(items.len())
+    }
+
+    /// Key patches of image `index` of a side this cache described.
+    pub fn patches(&self, features: &Features, index: usize) -> Result<Arc<PackedPatches>, EvalError> {
+        let missing = |hash: &ContentHash| {
+            let source =
+                std::io::Error::new(std::io::ErrorKind::NotFound, "the record vanished or was damaged during the run");
+            EvalError::Io { path: self.path(hash), source }
+        };
+        let hash = features.records[index]
+            .ok_or_else(|| EvalError::Setting(format!("image {index} was unreadable and has no key patches")))?;
+        self.memory.get_or_insert_with(&hash, || {
+            let record = self.read(&hash).ok_or_else(|| missing(&hash))?;
+            Ok(Arc::new(record.descriptor.patches))
+        })
+    }
+
+    fn find(&self, describer: &dyn Describe, item: &Item) -> Result<Loaded, String> {
+        let bytes = std::fs::read(&item.path).map_err(|error| error.to_string())?;
+        let hash = ContentHash::of(&bytes);
+        if let Some(record) = self.read(&hash) {
+            return Ok(Loaded::Done(hash, Box::new(record)));
+        }
+        let start = Instant::now();
+        let tensor = describer.tensor(&bytes)?;
+        Ok(Loaded::Decoded(hash, tensor, start.elapsed().as_secs_f64()))
+    }
+
+    fn describe_missing(
+        &self,
+        describer: &dyn Describe,
+        found: &mut [Result<Loaded, String>],
+        fresh: &mut usize,
+    ) -> Result<(), EvalError> {
+        let missing: Vec<usize> = (0..found.len()).filter(|&i| matches!(found[i], Ok(Loaded::Decoded(..)))).collect();
+        for batch in missing.chunks(BATCH) {
+            let (mut slots, mut tensors) = (Vec::new(), Vec::new());
+            for &index in batch {
+                if let Ok(Loaded::Decoded(hash, tensor, decode)) =
+                    std::mem::replace(&mut found[index], Err(String::new()))
+                {
+                    slots.push((index, hash, decode));
+                    tensors.push(tensor);
+                }
+            }
+            let start = Instant::now();
+            let descriptors = describer.describe(&tensors)?;
+            let extract = start.elapsed().as_secs_f64() / tensors.len() as f64;
+            for ((index, hash, decode), descriptor) in slots.into_iter().zip(descriptors) {
+                let record = Record { seconds: ExtractionSeconds { decode, extract }, blob_bytes: 0, descriptor };
+                found[index] = Ok(Loaded::Done(hash, Box::new(self.write(&hash, record)?)));
+                *fresh += 1;
+            }
+        }
+        Ok(())
+    }
+
+    fn path(&self, hash: &ContentHash) -> PathBuf {
+        let name = hash.to_string();
+        self.folder.join(&name[..2]).join(format!("{name}.features"))
+    }
+
+    /// The record, if it is there and whole.
+    fn read(&self, hash: &ContentHash) -> Option<Record> {
+        let bytes = std::fs::read(self.path(hash)).ok()?;
+        let record = Record::decode(&bytes);
+        if record.is_none() {
+            tracing::warn!(image = %hash, "a cached feature record is damaged; it is computed anew");
+        }
+        record
+    }
+
+    fn write(&self, hash: &ContentHash, mut record: Record) -> Result<Record, EvalError> {
+        let path = self.path(hash);
+        let folder = path.parent().unwrap_or(&self.folder);
+        std::fs::create_dir_all(folder).map_err(EvalError::io(folder))?;
+        let bytes = record.encode()?;
+        // The process id keeps two runs that share the cache out of each other's way.
+        let draft = path.with_extension(format!("{}.part", std::process::id()));
+        std::fs::write(&draft, bytes).map_err(EvalError::io(&draft))?;
+        std::fs::rename(&draft, &path).map_err(EvalError::io(&path))?;
+        Ok(record)
+    }
+}
+
+enum Loaded {
+    Done(ContentHash, Box<Record>),
+    Decoded(ContentHash, ImageTensor, f64),
+}
+
+#[derive(Default)]
+struct Collected {
+    dim: usize,
+    globals: Vec<f32>,
+    records: Vec<Option<ContentHash>>,
+    unreadable: Vec<Unreadable>,
+    blob_bytes: usize,
+    pooled_dim: usize,
+    decode: f64,
+    extract: f64,
+    fresh: usize,
+}
+
+impl Collected {
+    fn add(
+        &mut self,
+        item: &Item,
+        side: &'static str,
+        kind: GlobalKind,
+        result: Result<Loaded, String>,
+    ) -> Result<(), EvalError> {
+        let (hash, record) = match result {
+            Ok(Loaded::Done(hash, record)) => (hash, record),
+            Ok(Loaded::Decoded(..)) => return Err(EvalError::Setting("a decoded image was left undescribed".into())),
+            Err(reason) => {
+                self.unreadable.push(Unreadable { name: item.name.clone(), side, reason });
+                self.records.push(None);
+                self.globals.resize(self.records.len() * self.dim, 0.0);
+                return Ok(());
+            }
+        };
+        let vector = match kind {
+            GlobalKind::Head => record.descriptor.global,
+            GlobalKind::Mean => record.descriptor.pooled.clone(),
+        };
+        if self.dim == 0 {
+            // Unreadable images may have come first: their rows are made up for now that the length is known.
+            self.dim = vector.len();
+            self.globals.resize(self.records.len() * self.dim, 0.0);
+        }
+        self.globals.extend_from_slice(&vector);
+        self.records.push(Some(hash));
+        self.blob_bytes += record.blob_bytes;
+        self.pooled_dim = record.descriptor.pooled.len();
+        self.decode += record.seconds.decode;
+        self.extract += record.seconds.extract;
+        Ok(())
+    }
+
+    fn finish(self, count: usize) -> Result<Features, EvalError> {
+        debug_assert_eq!(self.records.len(), count);
+        let readable = (count - self.unreadable.len()).max(1) as f64;
+        Ok(Features {
+            dim: self.dim,
+            globals: self.globals,
+            records: self.records,
+            patch_bytes: self.blob_bytes as f64 / readable,
+            pooled_dim: self.pooled_dim,
+            unreadable: self.unreadable,
+            seconds: ExtractionSeconds { decode: self.decode / readable, extract: self.extract / readable },
+            fresh: self.fresh,
+        })
+    }
+}
+
+/// A descriptor with what it cost.
+#[derive(Debug, Clone, PartialEq)]
+struct Record {
+    seconds: ExtractionSeconds,
+    /// Length of the encoded key patches.
+    blob_bytes: usize,
+    descriptor: Descriptor,
+}
+
+const MAGIC: &[u8; 8] = b"PFFEAT01";
+const HEADER: usize = 8 + 2 * 8 + 2 * 4;
+
+impl Record {
+    /// Magic, seconds, lengths, global and pooled vectors, key patches as the store encodes them, CRC-32 of it all.
+    fn encode(&mut self) -> Result<Vec<u8>, EvalError> {
+        let blob = codec::encode(&self.descriptor.patches).map_err(|error| EvalError::Setting(error.to_string()))?;
+        self.blob_bytes = blob.len();
+        let mut bytes = MAGIC.to_vec();
+        bytes.extend(self.seconds.decode.to_le_bytes());
+        bytes.extend(self.seconds.extract.to_le_bytes());
+        bytes.extend((self.descriptor.global.len() as u32).to_le_bytes());
+        bytes.extend((self.descriptor.pooled.len() as u32).to_le_bytes());
+        for value in self.descriptor.global.iter().chain(&self.descriptor.pooled) {
+            bytes.extend(value.to_le_bytes());
+        }
+        bytes.extend(blob);
+        bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
+        Ok(bytes)
+    }
+
+    /// None unless every byte is as it was written.
+    fn decode(bytes: &[u8]) -> Option<Self> {
+        let (content, checksum) = bytes.split_last_chunk::<4>()?;
+        if crc32fast::hash(content) != u32::from_le_bytes(*checksum) || !content.starts_with(MAGIC) {
+            return None;
+        }
+        let number = |at: usize| Some(f64::from_le_bytes(content.get(at..at + 8)?.try_into().ok()?));
+        let length = |at: usize| Some(u32::from_le_bytes(content.get(at..at + 4)?.try_into().ok()?) as usize);
+        let (global, pooled) = (length(24)?, length(28)?);
+        let vectors = content.get(HEADER..HEADER.checked_add(4 * global.checked_add(pooled)?)?)?;
+        let mut values = vectors.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+        let blob = content.get(HEADER + vectors.len()..)?;
+        Some(Self {
+            seconds: ExtractionSeconds { decode: number(8)?, extract: number(16)? },
+            blob_bytes: blob.len(),
+            descriptor: Descriptor {
+                global: values.by_ref().take(global).collect(),
+                pooled: values.collect(),
+                patches: codec::decode(blob).ok()?,
+            },
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::types::{ImageSize, PatchGrid, PoolingStride};
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    /// Describes an image by its first byte; refuses those that start with `!`.
+    struct FirstByte {
+        model: ModelId,
+        described: AtomicUsize,
+    }
+
+    impl FirstByte {
+        fn new(model: &str) -> Self {
+            Self { model: ModelId::new(model), described: AtomicUsize::new(0) }
+        }
+    }
+
+    impl Describe for FirstByte {
+        fn model(&self) -> &ModelId {
+            &self.model
+        }
+
+        fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String> {
+            match bytes.first() {
+                None => Err("the image is empty".into()),
+                Some(b'!') => Err("not an image".into()),
+                Some(&byte) => Ok(ImageTensor { size: ImageSize { width: 1, height: 1 }, data: vec![f32::from(byte)] }),
+            }
+        }
+
+        fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, EvalError> {
+            self.described.fetch_add(images.len(), Ordering::Relaxed);
+            let grid = PatchGrid { columns: 4, rows: 3, patch_px: 14, stride: PoolingStride::Kernel };
+            let descriptor = |image: &ImageTensor| {
+                let value = image.data[0];
+                let patches = PackedPatches {
+                    grid,
+                    dim: 2,
+                    counts: [1, 0, 0],
+                    index: vec![5],
+                    attention: vec![half::f16::ONE],
+                    factor: vec![value],
+                    codes: vec![1, -1],
+                };
+                Descriptor { global: vec![value, 1.0], pooled: vec![value; 3], patches }
+            };
+            Ok(images.iter().map(descriptor).collect())
+        }
+    }
+
+    fn items(folder: &Path, contents: &[(&str, &[u8])]) -> Vec<Item> {
+        let item = |(name, content): &(&str, &[u8])| {
+            let path = folder.join(name);
+            std::fs::write(&path, content).unwrap();
+            Item::new(*name, path)
+        };
+        contents.iter().map(item).collect()
+    }
+
+    fn run(describer: &FirstByte, root: &Path, items: &[Item], kind: GlobalKind) -> (FeatureCache, Features) {
+        let cache = FeatureCache::open(root, describer.model(), 1 << 20).unwrap();
+        let features = cache.describe_all(describer, items, "database", kind, &ProgressBar::hidden()).unwrap();
+        (cache, features)
+    }
+
+    const CONTENTS: [(&str, &[u8]); 5] =
+        [("bad.jpg", b"!x"), ("a.jpg", b"a"), ("empty.jpg", b""), ("b.jpg", b"b"), ("copy_of_a.jpg", b"a")];
+
+    #[test]
+    fn unreadable_images_are_listed_and_the_others_keep_their_places() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut items = items(folder.path(), &CONTENTS);
+        items.push(Item::new("gone.jpg", folder.path().join("gone.jpg")));
+        let (cache, features) = run(&FirstByte::new("m"), folder.path(), &items, GlobalKind::Head);
+        assert_eq!(features.globals, [0.0, 0.0, 97.0, 1.0, 0.0, 0.0, 98.0, 1.0, 97.0, 1.0, 0.0, 0.0]);
+        assert_eq!((features.global(1), features.global(2)), (Some(&[97.0, 1.0][..]), None));
+        let names: Vec<_> = features.unreadable.iter().map(|u| u.name.as_str()).collect();
+        assert_eq!(names, ["bad.jpg", "empty.jpg", "gone.jpg"]);
+        assert_eq!(features.unreadable[0].reason, "not an image");
+        assert_eq!(cache.patches(&features, 3).unwrap().factor, [98.0]);
+        assert!(cache.patches(&features, 0).is_err());
+    }
+
+    #[test]
+    fn a_second_run_computes_nothing_and_a_changed_image_only_itself() {
+        let folder = tempfile::tempdir().unwrap();
+        let all = items(folder.path(), &CONTENTS);
+        run(&FirstByte::new("m"), folder.path(), &all, GlobalKind::Head);
+        let again = FirstByte::new("m");
+        let second = run(&again, folder.path(), &all, GlobalKind::Mean).1;
+        assert_eq!((second.fresh, again.described.load(Ordering::Relaxed)), (0, 0));
+        assert_eq!((second.dim, second.pooled_dim), (3, 3));
+        std::fs::write(folder.path().join("b.jpg"), b"c").unwrap();
+        assert_eq!(run(&FirstByte::new("m"), folder.path(), &all, GlobalKind::Head).1.fresh, 1);
+        // Another model shares nothing.
+        assert_eq!(run(&FirstByte::new("n"), folder.path(), &all[1..2], GlobalKind::Head).1.fresh, 1);
+    }
+
+    #[test]
+    fn cut_or_changed_records_are_computed_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        let all = items(folder.path(), &[("a.jpg", b"a")]);
+        let (cache, features) = run(&FirstByte::new("m"), folder.path(), &all, GlobalKind::Head);
+        let path = cache.path(&features.records[0].unwrap());
+        let whole = std::fs::read(&path).unwrap();
+        let mut flipped = whole.clone();
+        flipped[40] ^= 1;
+        for damaged in [&whole[..whole.len() - 1], &whole[..3], &[][..], &flipped] {
+            std::fs::write(&path, damaged).unwrap();
+            let (cache, again) = run(&FirstByte::new("m"), folder.path(), &all, GlobalKind::Head);
+            assert_eq!((again.fresh, again.globals.as_slice()), (1, &[97.0, 1.0][..]));
+            assert!(cache.patches(&again, 0).is_ok());
+        }
+    }
+
+    #[test]
+    fn a_record_survives_its_encoding() {
+        let tensor = FirstByte::new("m").tensor(b"z").unwrap();
+        let descriptor = FirstByte::new("m").describe(&[tensor]).unwrap().remove(0);
+        let seconds = ExtractionSeconds { decode: 0.25, extract: 1.5 };
+        let mut record = Record { seconds, blob_bytes: 0, descriptor };
+        let bytes = record.encode().unwrap();
+        assert_eq!(Record::decode(&bytes), Some(record));
+    }
+}

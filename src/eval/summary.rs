@@ -1,0 +1,396 @@
+//! Everything measured in one run, as one value: printed, written as JSON, drawn in the report.
+
+use super::EvalError;
+use super::datasets::{Dataset, Skipped, Truth};
+use super::features::{Features, GlobalKind, Unreadable};
+use super::measure::{self, Calibration, Interval, Judged, PoseAccuracy, RECALL_AT, Rejection, ReliabilityBin, TopOne};
+use super::run::{Answer, QuerySeconds};
+use crate::rerank::RerankConfig;
+use crate::types::ModelId;
+use serde::Serialize;
+use std::collections::BTreeMap;
+
+/// A value before re-ranking and, if it was done, after.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Both<T> {
+    /// By global distance.
+    pub global: T,
+    /// By S; absent if nothing was re-ranked.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reranked: Option<T>,
+}
+
+impl<T> Both<T> {
+    fn of(reranked: bool, mut value: impl FnMut(Stage) -> T) -> Self {
+        Self { global: value(Stage::Global), reranked: reranked.then(|| value(Stage::Reranked)) }
+    }
+}
+
+/// Before or after re-ranking.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stage {
+    /// By global distance.
+    Global,
+    /// By S.
+    Reranked,
+}
+
+/// Values by k.
+pub type AtK<T> = BTreeMap<usize, T>;
+
+/// Mean seconds: per image for the first two, per query for the others.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct Seconds {
+    /// Decoding and resizing one image.
+    pub decode: f64,
+    /// Describing one image.
+    pub extract: f64,
+    /// Finding the candidates of one query.
+    pub search: f64,
+    /// Loading their key patches.
+    pub load: f64,
+    /// Matching and verifying them.
+    pub rerank: f64,
+}
+
+/// Bytes of one reference at rest, on average.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct Bytes {
+    /// Global descriptor, f32.
+    pub global: f64,
+    /// Vector kept for another head, f16.
+    pub pooled: f64,
+    /// Key patches of all scales.
+    pub patches: f64,
+}
+
+/// How far a probability fitted to the scores can be believed.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CalibrationSummary {
+    /// Fitted on all judged queries.
+    pub fitted: Calibration,
+    /// 0 to 1, of predictions made by five-fold cross-validation.
+    pub expected_calibration_error: f64,
+    /// Of the same predictions.
+    pub bins: Vec<ReliabilityBin>,
+}
+
+/// One part of a data set: a city, a condition.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct GroupSummary {
+    /// Queries with a match.
+    pub queries_with_match: usize,
+    /// Recall in percent.
+    pub recall: Both<AtK<Option<f64>>>,
+    /// Pose accuracy, where poses are known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub poses: Option<Both<[PoseAccuracy; 3]>>,
+}
+
+/// The settings of a run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RunConfig {
+    /// Identity of the model.
+    pub model: ModelId,
+    /// Which vector was searched.
+    pub global: GlobalKind,
+    /// Candidates re-ranked per query.
+    pub candidates: usize,
+    /// Settings of re-ranking; absent if it was left out.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rerank: Option<RerankConfig>,
+    /// Bootstrap resamples behind the intervals.
+    pub bootstrap: usize,
+    /// Seed of the bootstrap.
+    pub seed: u64,
+}
+
+/// The whole result.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Summary {
+    /// Name of the data set.
+    pub dataset: String,
+    /// Queries searched.
+    pub queries: usize,
+    /// Of these, queries known to have a match: recall is over them.
+    pub queries_with_match: usize,
+    /// Of these, queries known to have none: they judge rejection.
+    pub queries_without_match: usize,
+    /// Images searched in.
+    pub database: usize,
+    /// Recall in percent at 1, 5, 10, 20; null if no query has a known match.
+    pub recall: Both<AtK<Option<f64>>>,
+    /// 95% bootstrap intervals of the recalls.
+    pub recall_interval: Both<AtK<Interval>>,
+    /// Mean average precision at 1, 5, 10, 20, 0 to 1.
+    pub map: Both<AtK<f64>>,
+    /// Rejecting unknown places by distance, and by S.
+    pub rejection: Both<Rejection>,
+    /// Pose of the best match, where the data set has poses.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub poses: Option<Both<[PoseAccuracy; 3]>>,
+    /// Parts of the data set, if it has any.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub groups: BTreeMap<String, GroupSummary>,
+    /// Probability of being right from S and distance; absent if answers of both kinds are too few.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<CalibrationSummary>,
+    /// Mean seconds per image and per query.
+    pub seconds: Seconds,
+    /// Mean bytes of one reference.
+    pub bytes_per_reference: f64,
+    /// The same by part.
+    pub bytes: Bytes,
+    /// The settings.
+    pub config: RunConfig,
+    /// Images that could not be read.
+    pub unreadable: Vec<Unreadable>,
+    /// Images the reader of the data set left out.
+    pub skipped: Vec<Skipped>,
+    /// What else there is to know.
+    pub notes: Vec<String>,
+}
+
+/// Fewest right and fewest wrong answers a calibration is fitted on.
+const CALIBRATION_MINIMUM: usize = 5;
+
+/// Measures the answers.
+pub fn summarise(
+    dataset: &Dataset,
+    database: &Features,
+    queries: &Features,
+    answers: &[Answer],
+    seconds: QuerySeconds,
+    config: RunConfig,
+) -> Result<Summary, EvalError> {
+    let view = View { dataset, reranked: config.rerank.is_some() };
+    let all: Vec<&Answer> = answers.iter().collect();
+    let judged: Vec<&Answer> = all.iter().copied().filter(|a| dataset.truth[a.query] != Truth::Unknown).collect();
+    let with_match = view.with_match(&all);
+    let mut unreadable = database.unreadable.clone();
+    unreadable.extend(queries.unreadable.iter().cloned());
+    let bytes = Bytes {
+        global: 4.0 * database.dim as f64,
+        pooled: 2.0 * database.pooled_dim as f64,
+        patches: database.patch_bytes,
+    };
+    let interval = |stage| {
+        let hits = view.hits(&with_match, stage);
+        let intervals = measure::bootstrap_recall(&hits, &RECALL_AT, config.bootstrap, config.seed);
+        RECALL_AT.into_iter().zip(intervals).collect()
+    };
+    Ok(Summary {
+        dataset: dataset.name.clone(),
+        queries: answers.len(),
+        queries_with_match: with_match.len(),
+        queries_without_match: judged.len() - with_match.len(),
+        database: dataset.database.len() - database.unreadable.len(),
+        recall: Both::of(view.reranked, |stage| view.recall(&with_match, stage)),
+        recall_interval: Both::of(view.reranked, interval),
+        map: Both::of(view.reranked, |stage| view.mean_average_precision(&with_match, stage)),
+        rejection: Both::of(view.reranked, |stage| measure::rejection(&view.judged(&judged, stage))),
+        poses: view.poses(&all),
+        groups: view.groups(&all),
+        calibration: view.calibration(&judged, config.seed),
+        seconds: Seconds {
+            decode: database.seconds.decode,
+            extract: database.seconds.extract,
+            search: seconds.search,
+            load: seconds.load,
+            rerank: seconds.rerank,
+        },
+        bytes_per_reference: bytes.global + bytes.pooled + bytes.patches,
+        bytes,
+        config,
+        unreadable,
+        skipped: dataset.skipped.clone(),
+        notes: dataset.notes.clone(),
+    })
+}
+
+/// A data set with the question whether answers were re-ranked.
+struct View<'a> {
+    dataset: &'a Dataset,
+    reranked: bool,
+}
+
+fn ranking(answer: &Answer, stage: Stage) -> Vec<usize> {
+    match stage {
+        Stage::Global => answer.global_ranking(),
+        Stage::Reranked => answer.reranked_ranking(),
+    }
+}
+
+impl<'a> View<'a> {
+    fn positives(&self, answer: &Answer) -> &'a [usize] {
+        self.dataset.truth[answer.query].positives()
+    }
+
+    fn with_match<'b>(&self, answers: &[&'b Answer]) -> Vec<&'b Answer> {
+        answers.iter().copied().filter(|answer| !self.positives(answer).is_empty()).collect()
+    }
+
+    fn hits(&self, with_match: &[&Answer], stage: Stage) -> Vec<Option<usize>> {
+        with_match.iter().map(|answer| measure::first_hit(&ranking(answer, stage), self.positives(answer))).collect()
+    }
+
+    fn recall(&self, with_match: &[&Answer], stage: Stage) -> AtK<Option<f64>> {
+        let hits = self.hits(with_match, stage);
+        RECALL_AT.into_iter().map(|k| (k, measure::recall_at(&hits, k))).collect()
+    }
+
+    fn mean_average_precision(&self, with_match: &[&Answer], stage: Stage) -> AtK<f64> {
+        let mean = |k| {
+            let sum: f64 = with_match
+                .iter()
+                .map(|answer| measure::average_precision(&ranking(answer, stage), self.positives(answer), k))
+                .sum();
+            sum / with_match.len().max(1) as f64
+        };
+        RECALL_AT.into_iter().map(|k| (k, mean(k))).collect()
+    }
+
+    fn judged(&self, answers: &[&Answer], stage: Stage) -> Vec<Judged> {
+        let judge = |answer: &&Answer| {
+            let positives = self.positives(answer);
+            let (index, score) = match stage {
+                Stage::Global => answer.global.first().map(|n| (n.index, -f64::from(n.distance)))?,
+                Stage::Reranked => answer.reranked.first().map(|c| (c.index, f64::from(c.score.spatial_score)))?,
+            };
+            Some(Judged { score, correct: positives.binary_search(&index).is_ok(), has_match: !positives.is_empty() })
+        };
+        answers.iter().filter_map(judge).collect()
+    }
+
+    fn poses(&self, answers: &[&Answer]) -> Option<Both<[PoseAccuracy; 3]>> {
+        let known: Vec<&&Answer> =
+            answers.iter().filter(|answer| self.dataset.queries[answer.query].pose.is_some()).collect();
+        let accuracy = |stage| {
+            let pair = |answer: &&&Answer| {
+                let best = ranking(answer, stage).first().and_then(|&index| self.dataset.database[index].pose);
+                Some((self.dataset.queries[answer.query].pose?, best))
+            };
+            measure::pose_accuracy(&known.iter().filter_map(pair).collect::<Vec<_>>())
+        };
+        (!known.is_empty()).then(|| Both::of(self.reranked, accuracy))
+    }
+
+    fn groups(&self, answers: &[&Answer]) -> BTreeMap<String, GroupSummary> {
+        let mut groups: BTreeMap<&str, Vec<&Answer>> = BTreeMap::new();
+        for answer in answers {
+            if let Some(group) = &self.dataset.queries[answer.query].group {
+                groups.entry(group).or_default().push(answer);
+            }
+        }
+        let summary = |(name, members): (&str, Vec<&Answer>)| {
+            let with_match = self.with_match(&members);
+            let recall = Both::of(self.reranked, |stage| self.recall(&with_match, stage));
+            let poses = self.poses(&members);
+            (name.to_owned(), GroupSummary { queries_with_match: with_match.len(), recall, poses })
+        };
+        groups.into_iter().map(summary).collect()
+    }
+
+    fn calibration(&self, judged: &[&Answer], seed: u64) -> Option<CalibrationSummary> {
+        let top = |answer: &&Answer| {
+            let best = answer.reranked.first()?;
+            Some(TopOne {
+                spatial_score: f64::from(best.score.spatial_score),
+                global_distance: f64::from(best.distance),
+                correct: self.positives(answer).binary_search(&best.index).is_ok(),
+            })
+        };
+        let answers: Vec<TopOne> = judged.iter().filter_map(top).collect();
+        let right = answers.iter().filter(|answer| answer.correct).count();
+        if right.min(answers.len() - right) < CALIBRATION_MINIMUM {
+            return None;
+        }
+        let fitted = measure::fit(&answers, measure::RIDGE).ok()?;
+        let bins = measure::reliability(&measure::cross_validate(&answers, measure::RIDGE, 5, seed));
+        Some(CalibrationSummary { fitted, expected_calibration_error: measure::calibration_error(&bins), bins })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::datasets::Item;
+    use super::super::run::{Candidate, Neighbour};
+    use super::*;
+    use crate::rerank::PairScore;
+
+    fn answer(query: usize, global: &[usize], reranked: &[(usize, u32)]) -> Answer {
+        let candidate = |&(index, spatial_score): &(usize, u32)| Candidate {
+            index,
+            distance: 0.5,
+            score: PairScore { spatial_score, combinations: Vec::new() },
+        };
+        Answer {
+            query,
+            global: global
+                .iter()
+                .enumerate()
+                .map(|(rank, &index)| Neighbour { index, distance: rank as f32 })
+                .collect(),
+            reranked: reranked.iter().map(candidate).collect(),
+        }
+    }
+
+    fn features(n: usize, seconds: f64) -> Features {
+        let mut features = Features::empty_for_tests(n);
+        features.dim = 256;
+        features.pooled_dim = 384;
+        features.patch_bytes = 1000.0;
+        features.seconds.extract = seconds;
+        features
+    }
+
+    #[test]
+    fn a_run_by_hand() {
+        let truth = vec![Truth::Positives(vec![1]), Truth::Positives(vec![0, 2]), Truth::NoMatch, Truth::Unknown];
+        let items = |n: usize| (0..n).map(|i| Item::new(i.to_string(), "x")).collect();
+        let dataset = Dataset {
+            name: "hand".into(),
+            database: items(3),
+            queries: items(4),
+            truth,
+            skipped: Vec::new(),
+            notes: Vec::new(),
+        };
+        let answers = [
+            answer(0, &[0, 1, 2], &[(1, 40), (0, 5)]),
+            answer(1, &[0, 1, 2], &[(1, 9), (2, 8)]),
+            answer(2, &[2, 1, 0], &[(2, 3)]),
+            answer(3, &[2, 1, 0], &[(2, 99)]),
+        ];
+        let config = RunConfig {
+            model: ModelId::new("m"),
+            global: GlobalKind::Head,
+            candidates: 3,
+            rerank: Some(RerankConfig::default()),
+            bootstrap: 100,
+            seed: 1,
+        };
+        let seconds = QuerySeconds { search: 0.1, load: 0.2, rerank: 0.3 };
+        let summary = summarise(&dataset, &features(3, 2.0), &features(4, 9.0), &answers, seconds, config).unwrap();
+        assert_eq!((summary.queries, summary.queries_with_match, summary.queries_without_match), (4, 2, 1));
+        assert_eq!((summary.recall.global[&1], summary.recall.global[&5]), (Some(50.0), Some(100.0)));
+        assert_eq!(summary.recall.reranked.as_ref().unwrap()[&1], Some(50.0));
+        // S = 40 is right, 9 wrong, 3 has no match; the unlabelled query does not count.
+        let rejection = summary.rejection.reranked.as_ref().unwrap();
+        assert_eq!((rejection.curve.len(), rejection.recall_at_full_precision), (3, 50.0));
+        assert_eq!(summary.bytes_per_reference, 1024.0 + 768.0 + 1000.0);
+        let json = serde_json::to_value(&summary).unwrap();
+        assert_eq!(json["recall"]["global"]["1"], 50.0);
+        assert_eq!(json["seconds"]["extract"], 2.0);
+        assert_eq!(json["queries"], 4);
+        for key in ["1", "5", "10", "20"] {
+            assert!(json["recall"]["reranked"][key].is_number());
+        }
+        assert!(json["calibration"].is_null());
+        let text = super::super::report::text(&summary);
+        assert!(text.contains("hand: 4 queries (2 with a match, 1 without) against 3 references"), "{text}");
+        let page = super::super::report::html(&summary, &dataset, &answers, "");
+        assert_eq!(page.matches("<svg").count(), 3);
+        assert!(!page.contains("NaN") && !page.contains("src=\"http"));
+    }
+}
