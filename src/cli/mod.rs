@@ -12,6 +12,7 @@ pub mod load;
 pub mod map;
 pub mod match_images;
 pub mod model;
+pub mod model_args;
 pub mod openapi;
 pub mod query;
 pub mod serve;

@@ -1,13 +1,14 @@
 //! Search and re-ranking of every query, as the service does them, with the time each stage takes.
 
 use super::EvalError;
-use super::features::{FeatureCache, Features};
+use super::features::Features;
 use crate::rerank::{PairScore, RerankConfig, Reranked, Reranker};
 use crate::search::{IndexEntry, MapIndex};
-use crate::types::{GLOBAL_DIM, ReferenceFilter, ReferenceId};
+use crate::types::{GLOBAL_DIM, PackedPatches, ReferenceFilter, ReferenceId};
 use indicatif::ProgressBar;
 use rayon::prelude::*;
 use serde::Serialize;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// A database image with its distance to the query.
@@ -77,9 +78,12 @@ pub fn search_all(database: &Features, queries: &Features, candidates: usize) ->
     (answers, seconds)
 }
 
+/// Where key patches come from: the cache as it is, or what an ablation makes of it.
+pub type LoadPatches<'a> = dyn Fn(&Features, usize) -> Result<Arc<PackedPatches>, EvalError> + Sync + 'a;
+
 /// Re-ranks the candidates of every answer; the second value is the mean seconds per query (load, rerank).
 pub fn rerank_all(
-    cache: &FeatureCache,
+    patches: &LoadPatches<'_>,
     database: &Features,
     queries: &Features,
     mut answers: Vec<Answer>,
@@ -90,8 +94,8 @@ pub fn rerank_all(
     let mut seconds = QuerySeconds::default();
     for answer in &mut answers {
         let start = Instant::now();
-        let query = cache.patches(queries, answer.query)?;
-        let load = |neighbour: &Neighbour| cache.patches(database, neighbour.index);
+        let query = patches(queries, answer.query)?;
+        let load = |neighbour: &Neighbour| patches(database, neighbour.index);
         let candidates: Vec<_> = answer.global.par_iter().map(load).collect::<Result<_, _>>()?;
         seconds.load += start.elapsed().as_secs_f64();
         let start = Instant::now();

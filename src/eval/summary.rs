@@ -5,6 +5,7 @@ use super::datasets::{Dataset, Skipped, Truth};
 use super::features::{Features, GlobalKind, Unreadable};
 use super::measure::{self, Calibration, Interval, Judged, PoseAccuracy, RECALL_AT, Rejection, ReliabilityBin, TopOne};
 use super::run::{Answer, QuerySeconds};
+use crate::extract::ExtractConfig;
 use crate::rerank::RerankConfig;
 use crate::types::ModelId;
 use serde::Serialize;
@@ -96,6 +97,8 @@ pub struct RunConfig {
     pub global: GlobalKind,
     /// Candidates re-ranked per query.
     pub candidates: usize,
+    /// Settings of extraction, the preset's own values filled in.
+    pub extract: ExtractConfig,
     /// Settings of re-ranking; absent if it was left out.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rerank: Option<RerankConfig>,
@@ -366,6 +369,7 @@ mod tests {
             model: ModelId::new("m"),
             global: GlobalKind::Head,
             candidates: 3,
+            extract: ExtractConfig::default(),
             rerank: Some(RerankConfig::default()),
             bootstrap: 100,
             seed: 1,

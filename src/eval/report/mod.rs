@@ -1,10 +1,12 @@
 //! Results for people: text, and a self-contained HTML page.
 
+mod ablation;
 mod html;
 mod plots;
 mod svg;
 mod text;
 
+pub use ablation::{ablation_html, ablation_text};
 pub use html::{escape, page, table};
 pub use plots::plots;
 pub use svg::{Histogram, LineChart, Series};
@@ -15,8 +17,9 @@ use super::measure::RECALL_AT;
 use super::run::Answer;
 use super::summary::{AtK, GroupSummary, Summary};
 
-/// The whole page. `queries` is HTML that shows single queries as pictures, or empty.
-pub fn html(summary: &Summary, dataset: &Dataset, answers: &[Answer], queries: &str) -> String {
+/// The whole page. `details` is HTML that follows the plots: single queries as pictures, an ablation
+/// table, or nothing.
+pub fn html(summary: &Summary, dataset: &Dataset, answers: &[Answer], details: &str) -> String {
     let mut body = format!(
         "<p class=\"lead\">{} queries, {} with a match and {} without, against {} references. Model <code>{}</code>.</p>\n",
         summary.queries,
@@ -31,7 +34,7 @@ pub fn html(summary: &Summary, dataset: &Dataset, answers: &[Answer], queries: &
     body += &costs_table(summary);
     body += "<h2>Plots</h2>\n";
     body += &plots(summary, dataset, answers);
-    body += queries;
+    body += details;
     body += &problems(summary);
     let config = serde_json::to_string_pretty(&summary.config).unwrap_or_default();
     body += &format!("<h2>Settings</h2>\n<pre>{}</pre>\n", escape(&config));

@@ -1,0 +1,86 @@
+//! Flags that choose the model and its settings, for the subcommands that run it themselves.
+
+use crate::extract::{ExtractConfig, Extractor, HeadChoice, Precision, Preset};
+use crate::types::{ImageSize, PoolingStride, SCALES};
+use anyhow::Context;
+use std::path::PathBuf;
+
+/// The model and what it computes. What is left out is the preset's own.
+#[derive(Debug, Clone, clap::Args)]
+#[command(next_help_heading = "Model")]
+pub struct ModelOptions {
+    /// Backbone: dinov2-vits14, dinov2-vitb14, dinov2-vitl14 or placeformer-vits16.
+    #[arg(long, value_name = "NAME", default_value_t)]
+    pub preset: Preset,
+    /// Weights file; the preset's own are pulled on first use otherwise.
+    #[arg(long, env = "PLACEFORMER_WEIGHTS", value_name = "FILE")]
+    pub weights: Option<PathBuf>,
+    /// Projection to the global descriptor: default, none, or a file.
+    #[arg(long, value_name = "HEAD", default_value_t)]
+    pub head: HeadChoice,
+    /// Size images are squashed to, such as 448x336.
+    #[arg(long, value_name = "WxH")]
+    pub input_size: Option<ImageSize>,
+    /// 0-based block whose tokens and attention are used.
+    #[arg(long, value_name = "BLOCK")]
+    pub exit_block: Option<usize>,
+    /// Key patches must exceed this multiple of the uniform attention.
+    #[arg(long)]
+    pub tau: Option<f32>,
+    /// Most key patches at the three scales, such as 400,200,50.
+    #[arg(long, value_name = "N,N,N", value_delimiter = ',', num_args = 1)]
+    pub caps: Option<Vec<usize>>,
+    /// Distance between fused windows: kernel or one.
+    #[arg(long, value_parser = parse_stride)]
+    pub stride: Option<PoolingStride>,
+    /// Arithmetic of the linear layers: auto, f32, bf16 or int8.
+    #[arg(long, value_parser = parse_precision)]
+    pub precision: Option<Precision>,
+}
+
+fn parse_named<T: serde::de::DeserializeOwned>(text: &str, choices: &str) -> Result<T, String> {
+    serde_json::from_value(serde_json::Value::String(text.to_lowercase())).map_err(|_| format!("use {choices}"))
+}
+
+fn parse_stride(text: &str) -> Result<PoolingStride, String> {
+    parse_named(text, "kernel or one")
+}
+
+fn parse_precision(text: &str) -> Result<Precision, String> {
+    parse_named(text, "auto, f32, bf16 or int8")
+}
+
+impl ModelOptions {
+    /// The settings, checked.
+    pub fn extract_config(&self) -> anyhow::Result<ExtractConfig> {
+        let mut config = ExtractConfig {
+            preset: self.preset,
+            head: self.head.clone(),
+            input_size: self.input_size,
+            exit_block: self.exit_block,
+            ..Default::default()
+        };
+        if let Some(caps) = &self.caps {
+            config.caps = <[usize; SCALES]>::try_from(caps.as_slice())
+                .map_err(|_| anyhow::anyhow!("--caps needs three numbers, such as 400,200,50"))?;
+        }
+        config.tau = self.tau.unwrap_or(config.tau);
+        config.stride = self.stride.unwrap_or(config.stride);
+        config.precision = self.precision.unwrap_or(config.precision);
+        config.encoder_spec()?;
+        Ok(config)
+    }
+
+    /// The weights for `config`: the file given, if it is for this preset, else the preset's own.
+    pub fn weights_for(&self, config: &ExtractConfig) -> anyhow::Result<PathBuf> {
+        match &self.weights {
+            Some(path) if config.preset == self.preset => Ok(path.clone()),
+            _ => crate::extract::resolve_model(config).context("cannot obtain the model"),
+        }
+    }
+
+    /// Loads the model for `config`.
+    pub fn open(&self, config: &ExtractConfig) -> anyhow::Result<Extractor> {
+        Ok(Extractor::load(config, &self.weights_for(config)?, None)?)
+    }
+}
