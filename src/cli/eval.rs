@@ -175,7 +175,7 @@ impl OutputArgs {
     fn cache_folder(&self) -> anyhow::Result<PathBuf> {
         match &self.cache {
             Some(folder) => Ok(folder.clone()),
-            None => Ok(crate::extract::cache_dir()?.join("eval")),
+            None => Ok(crate::extract::pull::cache_dir()?.join("eval")),
         }
     }
 }

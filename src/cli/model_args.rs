@@ -75,7 +75,7 @@ impl ModelOptions {
     pub fn weights_for(&self, config: &ExtractConfig) -> anyhow::Result<PathBuf> {
         match &self.weights {
             Some(path) if config.preset == self.preset => Ok(path.clone()),
-            _ => crate::extract::resolve_model(config.preset, false).context("cannot obtain the model"),
+            _ => crate::extract::pull::resolve_model(config.preset, false).context("cannot obtain the model"),
         }
     }
 

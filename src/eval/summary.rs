@@ -146,12 +146,38 @@ pub struct Summary {
     pub bytes: Bytes,
     /// The settings.
     pub config: RunConfig,
+    /// Every query by itself.
+    pub outcomes: Vec<Outcome>,
     /// Images that could not be read.
     pub unreadable: Vec<Unreadable>,
     /// Images the reader of the data set left out.
     pub skipped: Vec<Skipped>,
     /// What else there is to know.
     pub notes: Vec<String>,
+}
+
+/// What became of one query; ranks begin at 1 and are absent where no positive was among the candidates.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Outcome {
+    /// Name of the query.
+    pub query: String,
+    /// Known positives.
+    pub positives: usize,
+    /// Rank of the first positive by global distance.
+    pub global_rank: Option<usize>,
+    /// Rank of the first positive by S.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reranked_rank: Option<usize>,
+    /// Name of the best answer, by S if that was asked for.
+    pub best: Option<String>,
+    /// Its distance.
+    pub global_distance: Option<f32>,
+    /// Its S.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub spatial_score: Option<u32>,
+    /// S of the positive ranked first.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub positive_score: Option<u32>,
 }
 
 /// Fewest right and fewest wrong answers a calibration is fitted on.
@@ -205,6 +231,7 @@ pub fn summarise(
         bytes_per_reference: bytes.global + bytes.pooled + bytes.patches,
         bytes,
         config,
+        outcomes: answers.iter().map(|answer| view.outcome(answer)).collect(),
         unreadable,
         skipped: dataset.skipped.clone(),
         notes: dataset.notes.clone(),
@@ -251,6 +278,26 @@ impl<'a> View<'a> {
             sum / with_match.len().max(1) as f64
         };
         RECALL_AT.into_iter().map(|k| (k, mean(k))).collect()
+    }
+
+    fn outcome(&self, answer: &Answer) -> Outcome {
+        let positives = self.positives(answer);
+        let rank = |stage| measure::first_hit(&ranking(answer, stage), positives);
+        let (global, reranked) = (rank(Stage::Global), rank(Stage::Reranked));
+        let best = match answer.reranked.first() {
+            Some(candidate) => Some((candidate.index, candidate.distance)),
+            None => answer.global.first().map(|neighbour| (neighbour.index, neighbour.distance)),
+        };
+        Outcome {
+            query: self.dataset.queries[answer.query].name.clone(),
+            positives: positives.len(),
+            global_rank: global.map(|rank| rank + 1),
+            reranked_rank: reranked.map(|rank| rank + 1),
+            best: best.map(|(index, _)| self.dataset.database[index].name.clone()),
+            global_distance: best.map(|(_, distance)| distance),
+            spatial_score: answer.reranked.first().map(|candidate| candidate.score.spatial_score),
+            positive_score: reranked.map(|rank| answer.reranked[rank].score.spatial_score),
+        }
     }
 
     fn judged(&self, answers: &[&Answer], stage: Stage) -> Vec<Judged> {
@@ -391,6 +438,10 @@ mod tests {
             assert!(json["recall"]["reranked"][key].is_number());
         }
         assert!(json["calibration"].is_null());
+        let outcome = &summary.outcomes[1];
+        assert_eq!((outcome.global_rank, outcome.reranked_rank), (Some(1), Some(2)));
+        assert_eq!((outcome.spatial_score, outcome.positive_score), (Some(9), Some(8)));
+        assert_eq!(summary.outcomes[2].reranked_rank, None);
         let text = super::super::report::text(&summary);
         assert!(text.contains("hand: 4 queries (2 with a match, 1 without) against 3 references"), "{text}");
         let page = super::super::report::html(&summary, &dataset, &answers, "");
