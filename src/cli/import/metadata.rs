@@ -1,0 +1,168 @@
+//! Where, whither and when a photo was taken: from the positions file, else from its name, else from its EXIF.
+//!
+//! Each field is taken from the first source that has it.
+
+use crate::eval::datasets::{UtmName, UtmZone};
+use crate::image::read_exif;
+use crate::types::{ExternalId, GeoPoint, Heading, ReferenceFields};
+use anyhow::{Context, anyhow, bail, ensure};
+use std::collections::{HashMap, HashSet};
+use std::path::Path;
+use time::OffsetDateTime;
+use time::format_description::well_known::Rfc3339;
+
+/// All that is known beside the photos themselves.
+pub(super) struct Metadata {
+    rows: HashMap<String, Row>,
+    zone: Option<UtmZone>,
+    require_position: bool,
+}
+
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct Row {
+    location: Option<GeoPoint>,
+    heading: Option<Heading>,
+    captured_at: Option<OffsetDateTime>,
+}
+
+impl Row {
+    fn or(self, other: Self) -> Self {
+        Self {
+            location: self.location.or(other.location),
+            heading: self.heading.or(other.heading),
+            captured_at: self.captured_at.or(other.captured_at),
+        }
+    }
+}
+
+impl Metadata {
+    /// Reads the positions file, if there is one.
+    pub(super) fn read(
+        positions: Option<&Path>,
+        zone: Option<UtmZone>,
+        require_position: bool,
+    ) -> anyhow::Result<Self> {
+        let read = |path: &Path| read_positions(path).with_context(|| format!("cannot use {}", path.display()));
+        let rows = positions.map(read).transpose()?.unwrap_or_default();
+        Ok(Self { rows, zone, require_position })
+    }
+
+    /// Rows that name none of the images, sorted.
+    pub(super) fn without_image<'a>(&self, images: impl Iterator<Item = &'a str>) -> Vec<&str> {
+        let images: HashSet<&str> = images.collect();
+        let mut names: Vec<&str> = self.rows.keys().map(String::as_str).filter(|name| !images.contains(name)).collect();
+        names.sort_unstable();
+        names
+    }
+
+    /// The fields of one photo; the error says that a position was required and none was found.
+    pub(super) fn fields(&self, name: &str, external_id: ExternalId, image: &[u8]) -> Result<ReferenceFields, String> {
+        let exif = read_exif(image);
+        let exif = Row { location: exif.location, heading: exif.heading, captured_at: exif.captured_at };
+        let named = UtmName::parse(name).map(|parsed| Row {
+            location: parsed.location(self.zone),
+            heading: parsed.heading,
+            captured_at: parsed.captured_at,
+        });
+        let listed = self.rows.get(name).copied().unwrap_or_default();
+        let Row { location, heading, captured_at } = listed.or(named.unwrap_or_default()).or(exif);
+        if self.require_position && location.is_none() {
+            return Err("no position in the positions file, the name or the EXIF".into());
+        }
+        Ok(ReferenceFields { external_id: Some(external_id), location, heading, captured_at, metadata: None })
+    }
+}
+
+fn read_positions(path: &Path) -> anyhow::Result<HashMap<String, Row>> {
+    let bytes = std::fs::read(path)?;
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
+    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(bytes);
+    let headers = reader.headers()?.clone();
+    let known = ["file", "lat", "lon", "heading", "captured_at"];
+    if let Some(unknown) = headers.iter().find(|header| !known.contains(header)) {
+        bail!("column {unknown:?} is not one of {}", known.join(", "));
+    }
+    ensure!(headers.iter().any(|header| header == "file"), "there is no column \"file\"");
+    let mut rows = HashMap::new();
+    for record in reader.records() {
+        let record = record?;
+        let line = record.position().map_or(0, csv::Position::line);
+        let field = |name: &str| {
+            let text = headers.iter().position(|header| header == name).and_then(|column| record.get(column));
+            text.filter(|text| !text.is_empty())
+        };
+        let file = field("file").ok_or_else(|| anyhow!("line {line}: file is empty"))?.replace('\\', "/");
+        let row = parse_row(&field).with_context(|| format!("line {line}"))?;
+        ensure!(rows.insert(file.clone(), row).is_none(), "line {line}: {file:?} has a row already");
+    }
+    Ok(rows)
+}
+
+fn parse_row<'a>(field: &impl Fn(&str) -> Option<&'a str>) -> anyhow::Result<Row> {
+    let number = |name: &str| match field(name) {
+        None => Ok(None),
+        Some(text) => text.parse::<f64>().map(Some).map_err(|_| anyhow!("{name} {text:?} is not a number")),
+    };
+    let location = match (number("lat")?, number("lon")?) {
+        (Some(lat), Some(lon)) => Some(GeoPoint::new(lat, lon)?),
+        (None, None) => None,
+        _ => bail!("lat and lon must be given both or not at all"),
+    };
+    let parse_time = |text: &str| {
+        OffsetDateTime::parse(text, &Rfc3339).with_context(|| format!("captured_at {text:?} is not an RFC 3339 time"))
+    };
+    Ok(Row {
+        location,
+        heading: number("heading")?.map(Heading::new).transpose()?,
+        captured_at: field("captured_at").map(parse_time).transpose()?,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(csv: &str) -> anyhow::Result<Metadata> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("positions.csv");
+        std::fs::write(&path, csv).unwrap();
+        Metadata::read(Some(&path), Some("33T".parse().unwrap()), true)
+    }
+
+    fn id() -> ExternalId {
+        "x".parse().unwrap()
+    }
+
+    #[test]
+    fn rows_come_first_then_names() {
+        let csv = "\u{feff}file,lat,lon,heading,captured_at\r\na\\b.jpg,45.5,12.25,-90,2026-05-17T09:30:00Z\r\n\
+                   @500000@5000000@@@@@@@123@.jpg,,,10,\r\n";
+        let metadata = read(csv).unwrap();
+        let fields = metadata.fields("a/b.jpg", id(), b"").unwrap();
+        assert_eq!(fields.location, Some(GeoPoint::new(45.5, 12.25).unwrap()));
+        assert_eq!(fields.heading.unwrap().degrees(), 270.0);
+        assert_eq!(fields.captured_at.unwrap().unix_timestamp(), 1_779_010_200);
+        // The position comes from the name and the zone given, the heading from the row.
+        let fields = metadata.fields("@500000@5000000@@@@@@@123@.jpg", id(), b"").unwrap();
+        assert!(fields.location.unwrap().distance_m(GeoPoint::new(45.153, 15.0).unwrap()) < 100.0, "{fields:?}");
+        assert_eq!(fields.heading.unwrap().degrees(), 10.0);
+        assert!(metadata.fields("unknown.jpg", id(), b"").is_err());
+        assert_eq!(metadata.without_image(["a/b.jpg"].into_iter()).len(), 1);
+    }
+
+    #[test]
+    fn damaged_rows_are_named_by_line() {
+        for (csv, part) in [
+            ("file,lat,lon\na.jpg,95,0\n", "line 2"),
+            ("file,lat,lon\na.jpg,1,\n", "both or not at all"),
+            ("file,lat,lon\na.jpg,north,2\n", "\"north\""),
+            ("file,captured_at\na.jpg,yesterday\n", "RFC 3339"),
+            ("file,latitude\na.jpg,1\n", "latitude"),
+            ("lat,lon\n1,2\n", "\"file\""),
+            ("file,lat,lon\na.jpg,1,2\na.jpg,1,2\n", "line 3"),
+        ] {
+            let error = read(csv).err().unwrap();
+            assert!(format!("{error:#}").contains(part), "{error:#}");
+        }
+    }
+}

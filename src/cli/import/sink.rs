@@ -1,0 +1,60 @@
+//! Where an import puts its photos.
+
+use crate::error::ErrorCode;
+use crate::types::{MapName, ReferenceFields};
+use bytes::Bytes;
+use std::collections::HashMap;
+
+/// A photo on its way.
+pub(super) struct Upload {
+    pub(super) map: MapName,
+    pub(super) fields: ReferenceFields,
+    pub(super) image: Bytes,
+}
+
+/// What became of it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Outcome {
+    /// New and durable, under this reference id.
+    Created(String),
+    /// It was there before, under this reference id.
+    Present(String),
+    /// Not stored.
+    Refused {
+        /// A code of the error table, or `unreachable`.
+        code: String,
+        /// The cause.
+        detail: String,
+    },
+}
+
+/// An outcome with the attempts it took.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Sent {
+    pub(super) outcome: Outcome,
+    pub(super) attempts: u32,
+}
+
+/// Takes photos from several threads at once.
+pub(super) trait Sink: Sync {
+    /// SHA-256 in hexadecimal by external id of all that the map holds; nothing if there is no such map.
+    fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, String>>;
+    /// Stores one photo; tries again itself where that may help.
+    fn send(&self, upload: Upload) -> Sent;
+}
+
+/// Whether an error would meet every other photo too.
+pub(super) fn is_hopeless(code: &str) -> bool {
+    let hopeless = [
+        ErrorCode::Unauthorized,
+        ErrorCode::Forbidden,
+        ErrorCode::ModelMismatch,
+        ErrorCode::DiskFull,
+        ErrorCode::RouteNotFound,
+        ErrorCode::ShuttingDown,
+    ];
+    code == UNREACHABLE || hopeless.iter().any(|known| known.as_str() == code)
+}
+
+/// The code for a server that never answered.
+pub(super) const UNREACHABLE: &str = "unreachable";

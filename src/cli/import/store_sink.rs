@@ -1,0 +1,89 @@
+//! Straight into a store, through the same pipeline as the server, without the server.
+
+use super::sink::{Outcome, Sent, Sink, Upload};
+use crate::config::{Config, Overrides};
+use crate::error::ErrorCode;
+use crate::extract::Extractor;
+use crate::extract::pull::resolve_model;
+use crate::ops::{Health, Metrics};
+use crate::pipeline::{IngestRequest, Parts, PipelineError, Service};
+use crate::store::SqliteStore;
+use crate::types::{MapName, ReferenceId};
+use anyhow::Context;
+use std::collections::HashMap;
+use std::path::Path;
+use std::sync::Arc;
+use tokio::runtime::Runtime;
+
+/// An opened store as a sink.
+pub(super) struct StoreSink {
+    service: Arc<Service>,
+    runtime: Runtime,
+}
+
+/// References listed at once when resuming.
+const PAGE: usize = 1000;
+
+impl StoreSink {
+    /// Loads the model and opens the store in `data` with the settings of `config`.
+    pub(super) fn open(data: &Path, config: Option<&Path>) -> anyhow::Result<Self> {
+        let overrides = Overrides { data: Some(data.to_owned()), ..Default::default() };
+        let config = Config::load(config, &overrides)?;
+        crate::kernels::self_check()?;
+        let weights = resolve_model(config.extract.preset, false).context("cannot obtain the model")?;
+        let extractor = Extractor::load(&config.extract, &weights, None)?;
+        let store = SqliteStore::open(data, &Default::default())?;
+        let service = Service::start(Parts {
+            store: Arc::new(store),
+            source: Arc::new(extractor),
+            image: config.image,
+            rerank: config.rerank,
+            pipeline: config.pipeline,
+            metrics: Arc::new(Metrics::new()?),
+            health: Arc::new(Health::default()),
+        })?;
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+        Ok(Self { service, runtime })
+    }
+
+    fn page(&self, map: &MapName, after: Option<ReferenceId>) -> Result<crate::store::Page, PipelineError> {
+        self.runtime.block_on(self.service.references(Some(map.clone()), after, PAGE))
+    }
+}
+
+impl Sink for StoreSink {
+    fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, String>> {
+        let mut present = HashMap::new();
+        let mut after = None;
+        loop {
+            let page = match self.page(map, after) {
+                Ok(page) => page,
+                Err(error) if error.code() == ErrorCode::MapNotFound => break,
+                Err(error) => return Err(error.into()),
+            };
+            for reference in page.references {
+                if let Some(id) = reference.fields.external_id {
+                    present.insert(id.into(), reference.content_hash.to_string());
+                }
+            }
+            after = page.next;
+            if after.is_none() {
+                break;
+            }
+        }
+        Ok(present)
+    }
+
+    fn send(&self, upload: Upload) -> Sent {
+        let Upload { map, fields, image } = upload;
+        let outcome = match self.runtime.block_on(self.service.ingest(IngestRequest { map, fields, image })) {
+            Ok(answer) if answer.created => Outcome::Created(answer.reference.id.to_string()),
+            Ok(answer) => Outcome::Present(answer.reference.id.to_string()),
+            Err(error) => Outcome::Refused {
+                code: error.code().as_str().into(),
+                detail: format!("{:#}", anyhow::Error::new(error)),
+            },
+        };
+        Sent { outcome, attempts: 1 }
+    }
+}
