@@ -203,12 +203,30 @@ fn export(dir: &Path, percent: u32, scene: &Scene) {
     println!("wrote {}", path.display());
 }
 
+/// Milliseconds of CPU time that all threads of this process spent on `work`: on a busy machine the ratios of these
+/// mean more than those of wall time. Zero where the system does not tell.
+fn cpu_ms<T>(work: impl FnOnce() -> T) -> (f64, T) {
+    let spent = || -> u64 {
+        let tasks = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
+        let schedule = tasks.filter_map(|task| std::fs::read_to_string(task.path().join("schedstat")).ok());
+        schedule.filter_map(|text| text.split(' ').next()?.parse::<u64>().ok()).sum()
+    };
+    let before = spent();
+    let result = work();
+    (spent().saturating_sub(before) as f64 / 1e6, result)
+}
+
 fn bench(criterion: &mut Criterion, percent: u32, scene: &Scene) {
     let query = PackedPatches::quantise(&scene.query);
     let candidates: Vec<_> = scene.candidates.iter().map(PackedPatches::quantise).collect();
     let reranker = Reranker::new(RerankConfig::default());
     let matching = Reranker::new(RerankConfig { max_iterations: 0, ..RerankConfig::default() });
-    println!("{percent}%: inliers ours {}, baseline {}", ours(&reranker, &query, &candidates), baseline(scene));
+    ours(&reranker, &query, &candidates);
+    let (ours_cpu, ours_inliers) = cpu_ms(|| ours(&reranker, &query, &candidates));
+    let (matching_cpu, _) = cpu_ms(|| ours(&matching, &query, &candidates));
+    let (baseline_cpu, baseline_inliers) = cpu_ms(|| baseline(scene));
+    println!("{percent}%: inliers ours {ours_inliers}, baseline {baseline_inliers}");
+    println!("{percent}%: CPU ms ours {ours_cpu:.0} (matching {matching_cpu:.0}), baseline {baseline_cpu:.0}");
     let mut group = criterion.benchmark_group("rerank_100");
     group.sample_size(10);
     let name = |who: &str| BenchmarkId::new(who, format!("{percent}%"));

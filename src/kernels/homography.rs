@@ -17,31 +17,33 @@ pub const LANES: usize = 8;
 /// Correspondences by coordinate, in units of the tolerance; the memory is kept when refilled.
 #[derive(Debug, Clone, Default)]
 pub struct PointPairs {
-    len: usize,
-    /// Query x and y, reference x and y; padded to whole vectors with NaN, which is never an inlier.
+    /// As filled: what samples are taken from.
+    pairs: Vec<[f32; 4]>,
+    /// By axis: query x and y, reference x and y; padded to whole vectors with NaN, which is never an inlier.
     coordinates: [Vec<f32>; 4],
 }
 
 impl PointPairs {
     /// Replaces the correspondences by `(x, y, u, v)`.
     pub fn fill(&mut self, pairs: impl IntoIterator<Item = [f32; 4]>) {
-        self.coordinates.iter_mut().for_each(Vec::clear);
-        for pair in pairs {
-            self.coordinates.iter_mut().zip(pair).for_each(|(all, value)| all.push(value));
+        self.pairs.clear();
+        self.pairs.extend(pairs);
+        let padded = self.pairs.len().next_multiple_of(LANES);
+        for (axis, all) in self.coordinates.iter_mut().enumerate() {
+            all.clear();
+            all.extend(self.pairs.iter().map(|pair| pair[axis]));
+            all.resize(padded, f32::NAN);
         }
-        self.len = self.coordinates[0].len();
-        let padded = self.len.next_multiple_of(LANES);
-        self.coordinates.iter_mut().for_each(|all| all.resize(padded, f32::NAN));
     }
 
     /// Number of correspondences.
     pub fn len(&self) -> usize {
-        self.len
+        self.pairs.len()
     }
 
     /// Whether there is none.
     pub fn is_empty(&self) -> bool {
-        self.len == 0
+        self.pairs.is_empty()
     }
 
     /// The correspondence `(x, y, u, v)` at `i`.
@@ -50,8 +52,7 @@ impl PointPairs {
     /// Where there is none.
     #[inline(always)]
     pub fn get(&self, i: usize) -> [f32; 4] {
-        assert!(i < self.len, "there is no correspondence {i}");
-        [0, 1, 2, 3].map(|axis| self.coordinates[axis][i])
+        self.pairs[i]
     }
 }
 
@@ -105,6 +106,7 @@ fn solve_avx2(samples: &Samples, min_area: f32) -> Hypotheses {
 fn solve_lanes(samples: &Samples, min_area: f32) -> Hypotheses {
     let mut out = Hypotheses { entries: [[0.0; LANES]; 9], valid: [false; LANES] };
     let [x, y, u, v] = samples;
+    let (mut from_areas, mut to_areas) = ([[0f32; LANES]; 4], [[0f32; LANES]; 4]);
     for lane in 0..LANES {
         let twice_area = |px: &[[f32; LANES]; 4], py: &[[f32; LANES]; 4], a: usize, b: usize, c: usize| {
             (px[b][lane] - px[a][lane]) * (py[c][lane] - py[a][lane])
@@ -122,15 +124,22 @@ fn solve_lanes(samples: &Samples, min_area: f32) -> Hypotheses {
         let mut valid = true;
         for t in 0..4 {
             valid &= (from[t] * to[t] > 0.0) & (from[t].abs() > min_area) & (to[t].abs() > min_area);
+            (from_areas[t][lane], to_areas[t][lane]) = (from[t], to[t]);
         }
         out.valid[lane] = valid;
+    }
+    // Among false matches often none of the eight is valid.
+    if out.valid == [false; LANES] {
+        return out;
+    }
+    for lane in 0..LANES {
         let adjugate = |a: usize, b: usize| {
             [y[a][lane] - y[b][lane], x[b][lane] - x[a][lane], x[a][lane] * y[b][lane] - x[b][lane] * y[a][lane]]
         };
         let rows = [adjugate(1, 2), adjugate(2, 0), adjugate(0, 1)];
-        // The sign of `from[3]` makes the scale positive: w at corner i is weight_i times the determinant of A.
-        let sign = 1f32.copysign(from[3]);
-        let weights = [0, 1, 2].map(|corner| sign * (to[corner] / from[corner]));
+        // The sign of A's determinant makes the scale positive: w at corner i is weight_i times the determinant of A.
+        let sign = 1f32.copysign(from_areas[3][lane]);
+        let weights = [0, 1, 2].map(|corner| sign * (to_areas[corner][lane] / from_areas[corner][lane]));
         for column in 0..3 {
             let term = [0, 1, 2].map(|corner| weights[corner] * rows[corner][column]);
             out.entries[column][lane] = u[0][lane] * term[0] + u[1][lane] * term[1] + u[2][lane] * term[2];
@@ -158,8 +167,8 @@ pub fn count_inliers(simd: Simd, pairs: &PointPairs, homography: &[f32; 9], floo
 fn count_scalar(pairs: &PointPairs, homography: &[f32; 9], floor: usize) -> usize {
     let [a, b, c, d, e, f, g, h, i] = *homography;
     let mut count = 0;
-    for point in 0..pairs.len {
-        if point % STRIDE == 0 && count + (pairs.len - point) <= floor {
+    for point in 0..pairs.len() {
+        if point % STRIDE == 0 && count + (pairs.len() - point) <= floor {
             return count;
         }
         let [x, y, u, v] = pairs.get(point);
@@ -184,7 +193,7 @@ fn count_avx2(pairs: &PointPairs, homography: &[f32; 9], floor: usize) -> usize 
     let mut count = 0;
     let mut point = 0;
     while point < padded {
-        if point % STRIDE == 0 && count + (pairs.len - point) <= floor {
+        if point % STRIDE == 0 && count + (pairs.len() - point) <= floor {
             return count;
         }
         // SAFETY: `point + LANES <= padded`, the length of all four.

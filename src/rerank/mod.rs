@@ -31,7 +31,7 @@ pub struct RerankConfig {
     pub scales: Vec<ScaleSet>,
     /// Inlier tolerance in multiples of the base patch size.
     pub tolerance_patches: f32,
-    /// Most samples of four pairs drawn for one combination; degenerate ones count.
+    /// Most homographies scored for one combination; samples refused as degenerate or twisted do not count.
     pub max_iterations: u32,
     /// Probability with which the best homography should have been seen when the search stops early.
     pub confidence: f64,

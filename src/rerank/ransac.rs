@@ -16,6 +16,10 @@ use crate::kernels::homography::{self, LANES, PointPairs, Samples};
 /// the tolerance apart the smallest proper triangle has 0.11 (half-patch offsets) to 0.44.
 const MIN_AREA: f32 = 0.05;
 
+/// Samples drawn for every homography that may be scored: among false matches about one sample in eight keeps its
+/// orientation.
+const DRAWS_PER_HOMOGRAPHY: usize = 8;
+
 /// Settings of the search.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct RansacSettings {
@@ -139,8 +143,9 @@ impl Random {
         loop {
             let bits = self.next();
             let four = [0, 16, 32, 48].map(|shift| (((bits >> shift) & 0xffff) as usize * n) >> 16);
-            let repeats = (0..4).any(|i| four[..i].contains(&four[i]));
-            if !repeats {
+            let [a, b, c, d] = four;
+            // Without short cuts, which would be mispredicted.
+            if !((a == b) | (a == c) | (a == d) | (b == c) | (b == d) | (c == d)) {
                 return four;
             }
         }
@@ -158,11 +163,13 @@ struct Search<'a> {
 impl Search<'_> {
     fn run(&mut self, seed: u64, settings: &RansacSettings) {
         let mut random = Random(seed);
-        let (mut drawn, mut needed) = (0, settings.max_iterations as usize);
-        while drawn < needed {
+        let most_scored = settings.max_iterations as usize;
+        let (mut drawn, mut scored, mut needed) = (0, 0, most_scored * DRAWS_PER_HOMOGRAPHY);
+        while drawn < needed && scored < most_scored {
             let samples = self.draw(&mut random);
             let hypotheses = homography::solve_four(self.simd, &samples, MIN_AREA);
             for lane in (0..LANES).filter(|&lane| hypotheses.valid[lane]) {
+                scored += 1;
                 if self.consider(&hypotheses.get(lane)) {
                     needed = needed.min(self.draws_needed(settings));
                 }

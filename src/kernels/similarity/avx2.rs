@@ -68,11 +68,15 @@ unsafe fn dots(rows: *const i16, stride: usize, panel: &[Line<i16, 32>]) -> [[__
         unsafe {
             let columns = line.0.as_ptr().cast::<__m256i>();
             let (left, right) = (_mm256_load_si256(columns), _mm256_load_si256(columns.add(1)));
-            for (r, sum) in sums.iter_mut().enumerate() {
-                let pair = _mm256_set1_epi32(rows.add(r * stride + 2 * k).cast::<i32>().read_unaligned());
-                sum[0] = _mm256_add_epi32(sum[0], _mm256_madd_epi16(pair, left));
-                sum[1] = _mm256_add_epi32(sum[1], _mm256_madd_epi16(pair, right));
+            // Written out: with a loop over rows the compiler keeps the sums in memory.
+            macro_rules! rows {
+                ($($r:literal)*) => {$(
+                    let pair = _mm256_set1_epi32(rows.add($r * stride + 2 * k).cast::<i32>().read_unaligned());
+                    sums[$r][0] = _mm256_add_epi32(sums[$r][0], _mm256_madd_epi16(pair, left));
+                    sums[$r][1] = _mm256_add_epi32(sums[$r][1], _mm256_madd_epi16(pair, right));
+                )*};
             }
+            rows!(0 1 2 3 4 5);
         }
     }
     sums

@@ -67,11 +67,15 @@ unsafe fn dots(rows: *const u8, stride: usize, panel: &[Line<i8, 64>]) -> [[__m5
         unsafe {
             let left = _mm512_load_si512(lines[0].0.as_ptr().cast());
             let right = _mm512_load_si512(lines[1].0.as_ptr().cast());
-            for (r, sum) in sums.iter_mut().enumerate() {
-                let quad = _mm512_set1_epi32(rows.add(r * stride + 4 * k).cast::<i32>().read_unaligned());
-                sum[0] = _mm512_dpbusd_epi32(sum[0], quad, left);
-                sum[1] = _mm512_dpbusd_epi32(sum[1], quad, right);
+            // Written out: with a loop over rows the compiler keeps the sums in memory.
+            macro_rules! rows {
+                ($($r:literal)*) => {$(
+                    let quad = _mm512_set1_epi32(rows.add($r * stride + 4 * k).cast::<i32>().read_unaligned());
+                    sums[$r][0] = _mm512_dpbusd_epi32(sums[$r][0], quad, left);
+                    sums[$r][1] = _mm512_dpbusd_epi32(sums[$r][1], quad, right);
+                )*};
             }
+            rows!(0 1 2 3 4 5 6 7 8 9 10 11);
         }
     }
     sums
