@@ -55,3 +55,6 @@ impl Adam {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests;
