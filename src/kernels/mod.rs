@@ -6,17 +6,25 @@
 //! | [`simd`] | which instructions may be used: chosen once at start, or forced by `PLACEFORMER_SIMD` |
 //! | [`homography`] | four-point homographies and inlier counts, in vectors |
 //! | [`similarity`] | best partners among int8 descriptors: running row and column maxima |
+//! | [`gemm`], [`elementwise`], [`attention`] | the transformer: packed products, what lies between them, blocked softmax attention |
+//! | `lanes`, [`aligned`] | a vector register by level; buffers on cache lines |
 //!
 //! Every kernel takes a [`Simd`] and has a portable twin, which tests compare it with over odd sizes. Where tests ran
 //! on a CPU without AVX-512, that level is still guarded: [`self_check`] compares every kernel with its twin on the
 //! machine at hand before the program computes anything, and a level that disagrees is refused with an error.
 
+pub mod aligned;
+pub mod attention;
+pub mod elementwise;
+pub mod gemm;
 #[allow(clippy::needless_range_loop, reason = "lanes, corners and halves index several arrays at once")]
 pub mod homography;
+mod lanes;
 pub mod scan;
 pub mod simd;
 #[allow(clippy::needless_range_loop, reason = "sections and halves index several arrays at once")]
 pub mod similarity;
+mod testing;
 
 pub use simd::{Simd, SimdError, SimdLevel};
 
@@ -24,8 +32,14 @@ pub use simd::{Simd, SimdError, SimdLevel};
 type Check = fn(Simd) -> Result<(), String>;
 
 /// Every kernel's check, by the kernel's name.
-const CHECKS: &[(&str, Check)] =
-    &[("homography", homography::check), ("scan", scan::check), ("similarity", similarity::check)];
+const CHECKS: &[(&str, Check)] = &[
+    ("homography", homography::check),
+    ("scan", scan::check),
+    ("similarity", similarity::check),
+    ("gemm", gemm::check),
+    ("elementwise", elementwise::check),
+    ("attention", attention::check),
+];
 
 /// Chooses the level and compares every kernel at it with its scalar twin (a few milliseconds). Programs call this
 /// once at start.

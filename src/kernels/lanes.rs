@@ -1,0 +1,299 @@
+//! One vector register of f32 at each level, so that an elementwise kernel is written once and compiled three times.
+//!
+//! A kernel is an `#[inline(always)]` function generic over [`Lanes`]; [`at_level!`] instantiates it inside one
+//! `#[target_feature]` function per level and picks among them by the [`Simd`](super::Simd) token. The portable
+//! instance is the scalar twin: plain Rust on arrays, no intrinsics.
+//!
+//! `min` and `max` follow x86: where either operand is NaN they give the second, so a kernel decides by the order of
+//! its operands whether NaN survives.
+
+#[cfg(target_arch = "x86_64")]
+use std::arch::x86_64::*;
+
+/// Added to and taken from a float below 2^22 in magnitude, it rounds to the nearest integer.
+pub(super) const ROUNDING: f32 = 12_582_912.0;
+
+/// A vector of f32.
+///
+/// # Safety
+/// Every method may be called only where the level's instructions are available; pointers must be valid for `COUNT`
+/// elements.
+pub(super) trait Lanes: Copy {
+    /// Elements per vector.
+    const COUNT: usize;
+
+    unsafe fn splat(value: f32) -> Self;
+    unsafe fn load(from: *const f32) -> Self;
+    unsafe fn store(self, to: *mut f32);
+    unsafe fn add(self, other: Self) -> Self;
+    unsafe fn sub(self, other: Self) -> Self;
+    unsafe fn mul(self, other: Self) -> Self;
+    /// `self * factor + term`, fused where the level can.
+    unsafe fn mul_add(self, factor: Self, term: Self) -> Self;
+    unsafe fn min(self, other: Self) -> Self;
+    unsafe fn max(self, other: Self) -> Self;
+    /// 2^n of a value that is `n + ROUNDING`, -126 <= n <= 127.
+    unsafe fn power_of_two(self) -> Self;
+    unsafe fn sum(self) -> f32;
+    unsafe fn maximum(self) -> f32;
+
+    /// The first `count` elements, the others `fill`.
+    #[inline(always)]
+    unsafe fn load_partial(from: *const f32, count: usize, fill: f32) -> Self {
+        let mut padded = [fill; 16];
+        // SAFETY: the caller vouches for `count` <= COUNT <= 16 elements at `from`.
+        unsafe {
+            std::ptr::copy_nonoverlapping(from, padded.as_mut_ptr(), count);
+            Self::load(padded.as_ptr())
+        }
+    }
+
+    /// Stores the first `count` elements.
+    #[inline(always)]
+    unsafe fn store_partial(self, to: *mut f32, count: usize) {
+        let mut padded = [0.0f32; 16];
+        // SAFETY: as above, for `to`.
+        unsafe {
+            self.store(padded.as_mut_ptr());
+            std::ptr::copy_nonoverlapping(padded.as_ptr(), to, count);
+        }
+    }
+}
+
+/// Eight floats in an array: what the compiler makes of plain Rust.
+#[derive(Clone, Copy)]
+pub(super) struct Portable([f32; 8]);
+
+impl Portable {
+    #[inline(always)]
+    fn zip(self, other: Self, apply: impl Fn(f32, f32) -> f32) -> Self {
+        Self(std::array::from_fn(|lane| apply(self.0[lane], other.0[lane])))
+    }
+}
+
+impl Lanes for Portable {
+    const COUNT: usize = 8;
+
+    #[inline(always)]
+    unsafe fn splat(value: f32) -> Self {
+        Self([value; 8])
+    }
+    #[inline(always)]
+    unsafe fn load(from: *const f32) -> Self {
+        // SAFETY: the caller vouches for 8 elements; the read need not be aligned.
+        Self(unsafe { from.cast::<[f32; 8]>().read_unaligned() })
+    }
+    #[inline(always)]
+    unsafe fn store(self, to: *mut f32) {
+        // SAFETY: as above.
+        unsafe { to.cast::<[f32; 8]>().write_unaligned(self.0) }
+    }
+    #[inline(always)]
+    unsafe fn add(self, other: Self) -> Self {
+        self.zip(other, |a, b| a + b)
+    }
+    #[inline(always)]
+    unsafe fn sub(self, other: Self) -> Self {
+        self.zip(other, |a, b| a - b)
+    }
+    #[inline(always)]
+    unsafe fn mul(self, other: Self) -> Self {
+        self.zip(other, |a, b| a * b)
+    }
+    #[inline(always)]
+    unsafe fn mul_add(self, factor: Self, term: Self) -> Self {
+        Self(std::array::from_fn(|lane| self.0[lane] * factor.0[lane] + term.0[lane]))
+    }
+    #[inline(always)]
+    unsafe fn min(self, other: Self) -> Self {
+        self.zip(other, |a, b| if a < b { a } else { b })
+    }
+    #[inline(always)]
+    unsafe fn max(self, other: Self) -> Self {
+        self.zip(other, |a, b| if a > b { a } else { b })
+    }
+    #[inline(always)]
+    unsafe fn power_of_two(self) -> Self {
+        Self(self.0.map(|value| f32::from_bits(value.to_bits().wrapping_add(127) << 23)))
+    }
+    #[inline(always)]
+    unsafe fn sum(self) -> f32 {
+        self.0.iter().sum()
+    }
+    #[inline(always)]
+    unsafe fn maximum(self) -> f32 {
+        self.0.iter().fold(f32::NEG_INFINITY, |a, &b| if a > b { a } else { b })
+    }
+}
+
+/// Eight floats in an AVX register.
+#[cfg(target_arch = "x86_64")]
+#[derive(Clone, Copy)]
+pub(super) struct Avx2(__m256);
+
+// SAFETY (every block): the trait's contract is that AVX2 and FMA are available and pointers are valid.
+#[cfg(target_arch = "x86_64")]
+impl Lanes for Avx2 {
+    const COUNT: usize = 8;
+
+    #[inline(always)]
+    unsafe fn splat(value: f32) -> Self {
+        Self(unsafe { _mm256_set1_ps(value) })
+    }
+    #[inline(always)]
+    unsafe fn load(from: *const f32) -> Self {
+        Self(unsafe { _mm256_loadu_ps(from) })
+    }
+    #[inline(always)]
+    unsafe fn store(self, to: *mut f32) {
+        unsafe { _mm256_storeu_ps(to, self.0) }
+    }
+    #[inline(always)]
+    unsafe fn add(self, other: Self) -> Self {
+        Self(unsafe { _mm256_add_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    unsafe fn sub(self, other: Self) -> Self {
+        Self(unsafe { _mm256_sub_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    unsafe fn mul(self, other: Self) -> Self {
+        Self(unsafe { _mm256_mul_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    unsafe fn mul_add(self, factor: Self, term: Self) -> Self {
+        Self(unsafe { _mm256_fmadd_ps(self.0, factor.0, term.0) })
+    }
+    #[inline(always)]
+    unsafe fn min(self, other: Self) -> Self {
+        Self(unsafe { _mm256_min_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    unsafe fn max(self, other: Self) -> Self {
+        Self(unsafe { _mm256_max_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    unsafe fn power_of_two(self) -> Self {
+        unsafe {
+            let biased = _mm256_add_epi32(_mm256_castps_si256(self.0), _mm256_set1_epi32(127));
+            Self(_mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased)))
+        }
+    }
+    #[inline(always)]
+    unsafe fn sum(self) -> f32 {
+        unsafe {
+            let half = _mm_add_ps(_mm256_castps256_ps128(self.0), _mm256_extractf128_ps::<1>(self.0));
+            let quarter = _mm_add_ps(half, _mm_movehl_ps(half, half));
+            _mm_cvtss_f32(_mm_add_ss(quarter, _mm_movehdup_ps(quarter)))
+        }
+    }
+    #[inline(always)]
+    unsafe fn maximum(self) -> f32 {
+        unsafe {
+            let half = _mm_max_ps(_mm256_castps256_ps128(self.0), _mm256_extractf128_ps::<1>(self.0));
+            let quarter = _mm_max_ps(half, _mm_movehl_ps(half, half));
+            _mm_cvtss_f32(_mm_max_ss(quarter, _mm_movehdup_ps(quarter)))
+        }
+    }
+}
+
+/// Sixteen floats in an AVX-512 register.
+#[cfg(target_arch = "x86_64")]
+#[derive(Clone, Copy)]
+pub(super) struct Avx512(__m512);
+
+// SAFETY (every block): the trait's contract is that AVX-512F is available and pointers are valid.
+#[cfg(target_arch = "x86_64")]
+impl Lanes for Avx512 {
+    const COUNT: usize = 16;
+
+    #[inline(always)]
+    unsafe fn splat(value: f32) -> Self {
+        Self(unsafe { _mm512_set1_ps(value) })
+    }
+    #[inline(always)]
+    unsafe fn load(from: *const f32) -> Self {
+        Self(unsafe { _mm512_loadu_ps(from) })
+    }
+    #[inline(always)]
+    unsafe fn store(self, to: *mut f32) {
+        unsafe { _mm512_storeu_ps(to, self.0) }
+    }
+    #[inline(always)]
+    unsafe fn add(self, other: Self) -> Self {
+        Self(unsafe { _mm512_add_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    unsafe fn sub(self, other: Self) -> Self {
+        Self(unsafe { _mm512_sub_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    unsafe fn mul(self, other: Self) -> Self {
+        Self(unsafe { _mm512_mul_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    unsafe fn mul_add(self, factor: Self, term: Self) -> Self {
+        Self(unsafe { _mm512_fmadd_ps(self.0, factor.0, term.0) })
+    }
+    #[inline(always)]
+    unsafe fn min(self, other: Self) -> Self {
+        Self(unsafe { _mm512_min_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    unsafe fn max(self, other: Self) -> Self {
+        Self(unsafe { _mm512_max_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    unsafe fn power_of_two(self) -> Self {
+        unsafe {
+            let biased = _mm512_add_epi32(_mm512_castps_si512(self.0), _mm512_set1_epi32(127));
+            Self(_mm512_castsi512_ps(_mm512_slli_epi32::<23>(biased)))
+        }
+    }
+    #[inline(always)]
+    unsafe fn sum(self) -> f32 {
+        unsafe { _mm512_reduce_add_ps(self.0) }
+    }
+    #[inline(always)]
+    unsafe fn maximum(self) -> f32 {
+        unsafe { _mm512_reduce_max_ps(self.0) }
+    }
+}
+
+/// Calls one of three instances of a kernel, each compiled for its level, by a `Simd` token.
+///
+/// `at_level!(simd, (name: Type = value, ...) -> Return, portable expression, avx2 expression, avx512 expression)`:
+/// the expressions see the named arguments.
+macro_rules! at_level {
+    ($simd:expr, ($($name:ident: $type:ty = $value:expr),* $(,)?) $(-> $return:ty)?,
+     $portable:expr, $avx2:expr, $avx512:expr $(,)?) => {{
+        #[inline(never)]
+        unsafe fn portable($($name: $type),*) $(-> $return)? {
+            // SAFETY: no instructions beyond the baseline; the caller vouches for the arguments.
+            unsafe { $portable }
+        }
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx2,fma")]
+        unsafe fn avx2($($name: $type),*) $(-> $return)? {
+            // SAFETY: called only below; the caller vouches for the arguments.
+            unsafe { $avx2 }
+        }
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni,avx2,fma")]
+        unsafe fn avx512($($name: $type),*) $(-> $return)? {
+            // SAFETY: called only below; the caller vouches for the arguments.
+            unsafe { $avx512 }
+        }
+        match $simd.level() {
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: the token proves the level; the surrounding function has checked the arguments.
+            $crate::kernels::SimdLevel::Avx512 => unsafe { avx512($($value),*) },
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: the same.
+            $crate::kernels::SimdLevel::Avx2 => unsafe { avx2($($value),*) },
+            // SAFETY: the same.
+            _ => unsafe { portable($($value),*) },
+        }
+    }};
+}
+pub(super) use at_level;
