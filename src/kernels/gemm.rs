@@ -189,42 +189,48 @@ impl TileJob {
         }
     }
 
+    // Pointers advance by `wrapping_add` because builds with assertions check `add` at every step, which this loop cannot
+    // afford; `multiply_panel` has checked once that every access lies inside its slice.
+    #[allow(clippy::needless_range_loop)] // Indices keep the sums in registers; iterators leave them in memory.
     #[inline(always)]
     unsafe fn tile<V: Lanes, const MR: usize, const NV: usize>(&self, left: *const f32, out: *mut f32) {
+        let vectors: [usize; NV] = std::array::from_fn(|vector| vector * V::COUNT);
+        let mut rows: [*const f32; MR] = std::array::from_fn(|row| left.wrapping_add(row * self.left_stride));
+        let places: [*mut f32; MR] = std::array::from_fn(|row| out.wrapping_add(row * self.out_stride));
         // SAFETY: the extents were checked by `multiply_panel`; the level's instructions are available.
         unsafe {
             let mut sums = [[V::splat(0.0); NV]; MR];
             if self.accumulate {
-                for (row, sums) in sums.iter_mut().enumerate() {
-                    for (vector, sum) in sums.iter_mut().enumerate() {
-                        *sum = V::load(out.add(row * self.out_stride + vector * V::COUNT));
+                for row in 0..MR {
+                    for vector in 0..NV {
+                        sums[row][vector] = V::load(places[row].wrapping_add(vectors[vector]));
                     }
                 }
             }
-            let (mut left, mut segment, mut remaining) = (left, self.right, self.k);
+            let (mut segment, mut remaining) = (self.right, self.k);
             while remaining > 0 {
                 let count = remaining.min(self.segment_rows);
                 let mut right = segment;
-                for _ in 0..count {
+                for at in 0..count {
                     let mut columns = [V::splat(0.0); NV];
-                    for (vector, column) in columns.iter_mut().enumerate() {
-                        *column = V::load(right.add(vector * V::COUNT));
+                    for vector in 0..NV {
+                        columns[vector] = V::load(right.wrapping_add(vectors[vector]));
                     }
-                    for (row, sums) in sums.iter_mut().enumerate() {
-                        let factor = V::splat(*left.add(row * self.left_stride));
-                        for (sum, &column) in sums.iter_mut().zip(&columns) {
-                            *sum = factor.mul_add(column, *sum);
+                    for row in 0..MR {
+                        let factor = V::broadcast(rows[row].wrapping_add(at));
+                        for vector in 0..NV {
+                            sums[row][vector] = factor.mul_add(columns[vector], sums[row][vector]);
                         }
                     }
-                    left = left.add(1);
-                    right = right.add(NV * V::COUNT);
+                    right = right.wrapping_add(NV * V::COUNT);
                 }
+                rows = rows.map(|row| row.wrapping_add(count));
                 remaining -= count;
                 segment = segment.wrapping_add(self.segment_stride);
             }
-            for (row, sums) in sums.iter().enumerate() {
-                for (vector, sum) in sums.iter().enumerate() {
-                    sum.store(out.add(row * self.out_stride + vector * V::COUNT));
+            for row in 0..MR {
+                for vector in 0..NV {
+                    sums[row][vector].store(places[row].wrapping_add(vectors[vector]));
                 }
             }
         }

@@ -24,6 +24,8 @@ pub(super) trait Lanes: Copy {
 
     unsafe fn splat(value: f32) -> Self;
     unsafe fn load(from: *const f32) -> Self;
+    /// One element in every place.
+    unsafe fn broadcast(from: *const f32) -> Self;
     unsafe fn store(self, to: *mut f32);
     unsafe fn add(self, other: Self) -> Self;
     unsafe fn sub(self, other: Self) -> Self;
@@ -60,6 +62,36 @@ pub(super) trait Lanes: Copy {
     }
 }
 
+/// A value at any address.
+#[derive(Clone, Copy)]
+#[repr(C, packed)]
+struct Unaligned<T>(T);
+
+/// The value at `place`. Where assertions are on, `read_unaligned` and the `loadu` intrinsics check for overlap, and a
+/// dereferenced pointer for null, at every call: the inner loops cannot afford either, and a reference is not checked.
+///
+/// # Safety
+/// `place` must be valid for reads of `T`; it need not be aligned.
+#[allow(clippy::transmute_ptr_to_ref)]
+#[inline(always)]
+unsafe fn read<T: Copy>(place: *const f32) -> T {
+    // SAFETY: the caller's; the packed type needs no alignment.
+    let value: &Unaligned<T> = unsafe { std::mem::transmute(place) };
+    value.0
+}
+
+/// As [`read`], for writing.
+///
+/// # Safety
+/// `place` must be valid for writes of `T`; it need not be aligned.
+#[allow(clippy::transmute_ptr_to_ref)]
+#[inline(always)]
+unsafe fn write<T: Copy>(place: *mut f32, value: T) {
+    // SAFETY: the caller's; the packed type needs no alignment.
+    let target: &mut Unaligned<T> = unsafe { std::mem::transmute(place) };
+    *target = Unaligned(value);
+}
+
 /// Eight floats in an array: what the compiler makes of plain Rust.
 #[derive(Clone, Copy)]
 pub(super) struct Portable([f32; 8]);
@@ -81,12 +113,17 @@ impl Lanes for Portable {
     #[inline(always)]
     unsafe fn load(from: *const f32) -> Self {
         // SAFETY: the caller vouches for 8 elements; the read need not be aligned.
-        Self(unsafe { from.cast::<[f32; 8]>().read_unaligned() })
+        Self(unsafe { read::<[f32; 8]>(from) })
+    }
+    #[inline(always)]
+    unsafe fn broadcast(from: *const f32) -> Self {
+        // SAFETY: as above, for one element.
+        Self([unsafe { read::<f32>(from) }; 8])
     }
     #[inline(always)]
     unsafe fn store(self, to: *mut f32) {
         // SAFETY: as above.
-        unsafe { to.cast::<[f32; 8]>().write_unaligned(self.0) }
+        unsafe { write::<[f32; 8]>(to, self.0) }
     }
     #[inline(always)]
     unsafe fn add(self, other: Self) -> Self {
@@ -142,11 +179,15 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn load(from: *const f32) -> Self {
-        Self(unsafe { _mm256_loadu_ps(from) })
+        Self(unsafe { read::<__m256>(from) })
+    }
+    #[inline(always)]
+    unsafe fn broadcast(from: *const f32) -> Self {
+        Self(unsafe { _mm256_set1_ps(read::<f32>(from)) })
     }
     #[inline(always)]
     unsafe fn store(self, to: *mut f32) {
-        unsafe { _mm256_storeu_ps(to, self.0) }
+        unsafe { write::<__m256>(to, self.0) }
     }
     #[inline(always)]
     unsafe fn add(self, other: Self) -> Self {
@@ -213,11 +254,15 @@ impl Lanes for Avx512 {
     }
     #[inline(always)]
     unsafe fn load(from: *const f32) -> Self {
-        Self(unsafe { _mm512_loadu_ps(from) })
+        Self(unsafe { read::<__m512>(from) })
+    }
+    #[inline(always)]
+    unsafe fn broadcast(from: *const f32) -> Self {
+        Self(unsafe { _mm512_set1_ps(read::<f32>(from)) })
     }
     #[inline(always)]
     unsafe fn store(self, to: *mut f32) {
-        unsafe { _mm512_storeu_ps(to, self.0) }
+        unsafe { write::<__m512>(to, self.0) }
     }
     #[inline(always)]
     unsafe fn add(self, other: Self) -> Self {
