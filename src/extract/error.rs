@@ -1,6 +1,7 @@
 //! Everything that can go wrong between a normalised image and its descriptor.
 
 use crate::error::ErrorCode;
+use crate::kernels::SimdError;
 use crate::types::{ImageSize, InvalidValue};
 use std::path::PathBuf;
 
@@ -94,6 +95,9 @@ pub enum ExtractError {
         /// Why not.
         reason: String,
     },
+    /// The kernels cannot be used as asked.
+    #[error(transparent)]
+    Simd(#[from] SimdError),
     /// The tensor library failed.
     #[error("computing the transformer failed: {0}")]
     Compute(String),
@@ -115,6 +119,7 @@ impl ExtractError {
     /// The row of the error table.
     pub fn code(&self) -> ErrorCode {
         match self {
+            Self::Simd(error) => error.code(),
             Self::Config(_) => ErrorCode::InvalidParameter,
             Self::HeadMismatch { .. } | Self::NoHead { .. } => ErrorCode::ModelMismatch,
             Self::Io { .. }

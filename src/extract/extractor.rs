@@ -3,13 +3,14 @@
 use super::config::{ExtractConfig, HeadChoice};
 use super::encoder::{EncodedImage, Encoder, EncoderSpec, Precision, check_image, token_grid};
 use super::error::ExtractError;
+use super::fused::FusedEncoder;
 use super::global::{l2_normalise, mean_token};
 use super::head::Head;
 use super::preset::Geometry;
 use super::trace::ExtractionTrace;
-use super::vit::CandleEncoder;
 use super::weights::VitWeights;
 use super::{fusion, positions, record, selection};
+use crate::kernels;
 use crate::types::{
     Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid, PoolingStride,
 };
@@ -198,7 +199,7 @@ impl Extractor {
     }
 }
 
-/// The encoder for `precision`.
+/// The encoder for `precision`, after every kernel it may use has agreed with its scalar twin on this machine.
 pub fn build_encoder(
     weights: &VitWeights,
     spec: &EncoderSpec,
@@ -208,8 +209,9 @@ pub fn build_encoder(
         let reason = "only f32 is implemented".into();
         Err(ExtractError::Precision { precision, reason })
     };
+    let simd = kernels::self_check()?;
     match precision {
-        Precision::Auto | Precision::F32 => Ok(Box::new(CandleEncoder::new(weights, spec)?)),
+        Precision::Auto | Precision::F32 => Ok(Box::new(FusedEncoder::new(weights, *spec, simd)?)),
         Precision::Bf16 => unavailable("bf16"),
         Precision::Int8 => unavailable("int8"),
     }

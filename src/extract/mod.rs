@@ -7,13 +7,15 @@
 //! ```
 //!
 //! [`Extractor`] puts it together from [`ExtractConfig`], a weights file and a [`Head`]; [`pull`] obtains the weights.
-//! [`Encoder`] is the seam at which a faster transformer can stand in for the candle one.
+//! [`Encoder`] is the seam between them and the transformer: [`FusedEncoder`] computes it for the service,
+//! [`CandleEncoder`] is the plain implementation it is tested against.
 
 mod activation;
 mod config;
 mod encoder;
 mod error;
 mod extractor;
+mod fused;
 mod fusion;
 mod global;
 mod head;
@@ -30,6 +32,7 @@ pub use config::{ExtractConfig, HeadChoice};
 pub use encoder::{EncodedImage, Encoder, EncoderSpec, Precision, TokenGrid, check_image, token_grid};
 pub use error::ExtractError;
 pub use extractor::{Extractor, build_encoder};
+pub use fused::FusedEncoder;
 pub use fusion::{attention_map, average_pool};
 pub use global::{l2_normalise, mean_token};
 pub use head::Head;

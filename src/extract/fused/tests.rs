@@ -1,0 +1,133 @@
+//! The fused encoder against the candle one, on small random transformers.
+
+use super::*;
+use crate::extract::CandleEncoder;
+use crate::extract::preset::Preset;
+use crate::extract::weights::{BlockWeights, Linear};
+use crate::types::ImageSize;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+struct Random(ChaCha8Rng);
+
+impl Random {
+    fn around(&mut self, len: usize, centre: f32, spread: f32) -> Vec<f32> {
+        (0..len).map(|_| centre + spread * self.0.random_range(-1.0f32..1.0)).collect()
+    }
+
+    fn linear(&mut self, outputs: usize, inputs: usize) -> Linear {
+        let spread = 2.0 / (inputs as f32).sqrt();
+        Linear { weight: self.around(outputs * inputs, 0.0, spread), bias: self.around(outputs, 0.0, 0.3) }
+    }
+
+    fn norm(&mut self, dim: usize) -> Norm {
+        Norm { weight: self.around(dim, 1.0, 0.5), bias: self.around(dim, 0.0, 0.3) }
+    }
+
+    fn block(&mut self, geometry: &Geometry) -> BlockWeights {
+        let Geometry { dim, mlp_dim, layer_scale, .. } = *geometry;
+        let scale = |random: &mut Self| layer_scale.then(|| random.around(dim, 0.5, 0.4));
+        BlockWeights {
+            norm1: self.norm(dim),
+            qkv: self.linear(3 * dim, dim),
+            proj: self.linear(dim, dim),
+            layer_scale1: scale(self),
+            norm2: self.norm(dim),
+            fc1: self.linear(mlp_dim, dim),
+            fc2: self.linear(dim, mlp_dim),
+            layer_scale2: scale(self),
+        }
+    }
+}
+
+/// Three blocks, 64 wide, with an MLP that is not whole slices.
+fn small(seed: u64, layer_scale: bool) -> VitWeights {
+    let geometry = Geometry { depth: 3, dim: 64, heads: 2, patch: 14, mlp_dim: 416, layer_scale };
+    let mut random = Random(ChaCha8Rng::seed_from_u64(seed));
+    VitWeights {
+        preset: Preset::Dinov2Vits14,
+        geometry,
+        position_grid: (5, 5),
+        patch_embed: random.linear(64, 3 * 14 * 14),
+        cls_token: random.around(64, 0.0, 1.0),
+        positions: random.around(26 * 64, 0.0, 1.0),
+        blocks: (0..3).map(|_| random.block(&geometry)).collect(),
+        norm: random.norm(64),
+    }
+}
+
+fn image(seed: u64, size: ImageSize) -> ImageTensor {
+    let len = 3 * (size.width * size.height) as usize;
+    ImageTensor { size, data: Random(ChaCha8Rng::seed_from_u64(seed)).around(len, 0.0, 2.0) }
+}
+
+fn spec(size: ImageSize, exit_block: usize, token_norm: bool, attention_block: usize) -> EncoderSpec {
+    EncoderSpec { input_size: size, exit_block, token_norm, attention_block }
+}
+
+fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+}
+
+#[test]
+fn equals_candle_at_every_level_size_and_exit() {
+    let sizes = [(14, 14), (98, 70), (70, 126), (154, 98)].map(|(width, height)| ImageSize { width, height });
+    let exits = [(0, false, 0), (2, true, 2), (0, false, 2), (2, false, 1)];
+    for (seed, (size, (exit, norm, attention))) in sizes.into_iter().zip(exits).enumerate() {
+        let weights = small(seed as u64, seed % 2 == 0);
+        let spec = spec(size, exit, norm, attention);
+        let image = image(seed as u64, size);
+        let expected = &CandleEncoder::new(&weights, &spec).unwrap().encode(std::slice::from_ref(&image)).unwrap()[0];
+        for simd in Simd::all() {
+            let fused = FusedEncoder::new(&weights, spec, simd).unwrap();
+            let actual = &fused.encode(std::slice::from_ref(&image)).unwrap()[0];
+            assert_eq!((actual.grid, actual.dim, actual.heads), (expected.grid, expected.dim, expected.heads));
+            let differences = [
+                largest_difference(&actual.tokens, &expected.tokens),
+                largest_difference(&actual.cls_token, &expected.cls_token),
+                largest_difference(&actual.cls_attention, &expected.cls_attention) * 100.0,
+            ];
+            let worst = differences.into_iter().fold(0.0, f32::max);
+            assert!(worst < 5e-4, "{} at {size}, exit {exit}: {differences:?}", fused.name());
+        }
+    }
+}
+
+#[test]
+fn a_batch_gives_bit_for_bit_what_single_images_give() {
+    let size = ImageSize { width: 112, height: 98 };
+    let images: Vec<_> = (0..5).map(|seed| image(seed, size)).collect();
+    for simd in Simd::all() {
+        let fused = FusedEncoder::new(&small(9, true), spec(size, 2, false, 2), simd).unwrap();
+        let together = fused.encode(&images).unwrap();
+        let singly: Vec<_> =
+            images.iter().flat_map(|image| fused.encode(std::slice::from_ref(image)).unwrap()).collect();
+        assert_eq!(together, singly);
+        assert_ne!(together[0].tokens, together[1].tokens);
+    }
+}
+
+#[test]
+fn a_broken_image_is_refused_and_leaves_no_trace() {
+    let size = ImageSize { width: 112, height: 98 };
+    let fused = FusedEncoder::new(&small(3, true), spec(size, 1, false, 1), Simd::best()).unwrap();
+    let good = [image(1, size)];
+    let before = fused.encode(&good).unwrap();
+    let mut broken = image(2, size);
+    broken.data[5000] = f32::NAN;
+    assert!(matches!(fused.encode(&[broken]), Err(ExtractError::NotFinite)));
+    assert_eq!(fused.encode(&good).unwrap(), before);
+    let wrong = ImageTensor { size, data: vec![0.0; 7] };
+    assert!(matches!(fused.encode(&[wrong]), Err(ExtractError::WrongLength { .. })));
+    assert!(fused.encode(&[]).unwrap().is_empty());
+}
+
+#[test]
+fn blocks_and_sizes_that_do_not_exist_are_refused() {
+    let weights = small(4, true);
+    let size = ImageSize { width: 28, height: 28 };
+    let build = |spec| FusedEncoder::new(&weights, spec, Simd::SCALAR).map(|_| ()).unwrap_err().to_string();
+    assert!(build(spec(size, 3, false, 0)).contains("block 3"));
+    assert!(build(spec(ImageSize { width: 30, height: 28 }, 0, false, 0)).contains("30x28"));
+}
