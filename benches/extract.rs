@@ -36,6 +36,7 @@ fn weights(preset: Preset) -> VitWeights {
     };
     VitWeights {
         preset,
+        unused_parameters: 0,
         geometry,
         position_grid: (37, 37),
         blocks: (0..geometry.depth).map(|_| block(&mut random)).collect(),

@@ -46,6 +46,7 @@ fn small(seed: u64, layer_scale: bool) -> VitWeights {
     let mut random = Random(ChaCha8Rng::seed_from_u64(seed));
     VitWeights {
         preset: Preset::Dinov2Vits14,
+        unused_parameters: 0,
         geometry,
         position_grid: (5, 5),
         patch_embed: random.linear(64, 3 * 14 * 14),
