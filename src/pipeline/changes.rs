@@ -30,30 +30,14 @@ impl Service {
         let entry = self.maps.entry(&self.store.get(id)?.map);
         let _changing = entry.changing();
         let reference = self.store.update(id, patch)?;
-        if let Some(live) = entry.live()
-            && moves
+        // Only what is in the index moves; a map of another model is not.
+        if let Some(live) = entry.live().filter(|_| moves)
+            && let Some(global) = live.index.global(id)
         {
-            self.reindex(&live.index, &reference)?;
+            let ReferenceFields { location, captured_at, .. } = reference.fields;
+            live.index.insert(IndexEntry { id, global, location, captured_at });
         }
         Ok(reference)
-    }
-
-    fn reindex(&self, index: &crate::search::MapIndex, reference: &Reference) -> Result<(), PipelineError> {
-        let mut found = None;
-        self.store.scan_globals(&reference.map, &mut |row| {
-            if row.reference == reference.id {
-                found = Some(row);
-            }
-        })?;
-        if let Some(row) = found {
-            index.insert(IndexEntry {
-                id: row.reference,
-                global: row.global,
-                location: row.location,
-                captured_at: row.captured_at,
-            });
-        }
-        Ok(())
     }
 
     fn delete_now(&self, id: ReferenceId) -> Result<Reference, PipelineError> {

@@ -67,10 +67,6 @@ impl Service {
 
     /// Refuses while disk or memory is short. Deleting is never refused.
     pub fn may_store(&self) -> Result<(), PipelineError> {
-        if self.health.is_draining() {
-            self.metrics.rejected(Rejection::Draining);
-            return Err(PipelineError::ShuttingDown);
-        }
         if self.health.is_disk_full() {
             self.metrics.rejected(Rejection::DiskFull);
             return Err(PipelineError::DiskFull);

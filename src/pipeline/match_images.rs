@@ -18,6 +18,12 @@ pub enum MatchSide {
     Reference(ReferenceId),
 }
 
+/// The second side, looked up before a place in the queue is taken.
+enum Side {
+    Image(Bytes),
+    Patches(Arc<PackedPatches>),
+}
+
 /// Everything about one pair.
 #[derive(Debug, Clone)]
 pub struct Matched {
@@ -47,20 +53,17 @@ impl Service {
     ///
     /// Cancel safety: dropped while waiting, nothing further is computed.
     pub async fn match_images(self: &Arc<Self>, query: Bytes, other: MatchSide) -> Result<MatchAnswer, PipelineError> {
-        let stored = match &other {
-            MatchSide::Reference(id) => Some(self.stored_patches(*id).await?),
-            MatchSide::Image(_) => None,
+        let other = match other {
+            MatchSide::Reference(id) => Side::Patches(self.stored_patches(id).await?),
+            MatchSide::Image(bytes) => Side::Image(bytes),
         };
         let _ticket = self.admission.enter()?;
         let deadline = Some(Deadline::after(Duration::from_millis(self.config.deadline_ms)));
         let mut timings = Timings::default();
         let query = Arc::new(self.extraction.describe(query, deadline, &mut timings).await?.patches);
-        let reference = match (stored, other) {
-            (Some(patches), _) => patches,
-            (None, MatchSide::Image(bytes)) => {
-                Arc::new(self.extraction.describe(bytes, deadline, &mut timings).await?.patches)
-            }
-            (None, MatchSide::Reference(id)) => self.stored_patches(id).await?,
+        let reference = match other {
+            Side::Patches(patches) => patches,
+            Side::Image(bytes) => Arc::new(self.extraction.describe(bytes, deadline, &mut timings).await?.patches),
         };
         let (service, started) = (self.clone(), Instant::now());
         let explained = blocking(move || {

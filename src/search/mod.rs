@@ -111,6 +111,16 @@ impl MapIndex {
         self.write().remove(id)
     }
 
+    /// The global descriptor of a reference, `[256]`; `None` if it is not there.
+    pub fn global(&self, id: ReferenceId) -> Option<Vec<f32>> {
+        let state = self.read();
+        if let Some(row) = state.tail.ids.iter().position(|&there| there == id) {
+            return Some(state.tail.vector(row).to_vec());
+        }
+        let (number, row) = state.find_sealed(id)?;
+        Some(state.sealed[number].block.vector(row).to_vec())
+    }
+
     /// The `k` nearest that pass `filter`, nearest first, ties by ascending id. Exact; see the module.
     ///
     /// # Panics

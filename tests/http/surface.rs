@@ -1,13 +1,11 @@
 //! Every route's happy path, through the router.
 
-mod support;
-
+use crate::support::{App, multipart, picture};
 use axum::body::Body;
 use axum::http::Request;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
-use support::{App, multipart, picture};
 
 #[tokio::test]
 async fn a_reference_is_created_shown_changed_and_deleted() {
@@ -90,7 +88,11 @@ async fn filters_and_options_shape_the_answer() {
     };
     let near = app.post_png("/query?map=m&near=50,3&radius_m=1000", 0).await;
     assert_eq!(names(near.ok()), ["3"]);
-    let mut timed = names(app.post_png("/query?map=m&captured_after=2026-01-02T00:00:00Z&captured_before=2026-01-04T00:00:00Z", 0).await.ok());
+    let mut timed = names(
+        app.post_png("/query?map=m&captured_after=2026-01-02T00:00:00Z&captured_before=2026-01-04T00:00:00Z", 0)
+            .await
+            .ok(),
+    );
     timed.sort();
     assert_eq!(timed, ["1", "2"]);
     let global = app.post_png("/query?map=m&rerank=false&top_k=2", 2).await;
@@ -255,7 +257,8 @@ fn every_operation_is_described_with_its_errors() {
             let name = format!("{method} {path}");
             assert!(operation["summary"].as_str().is_some_and(|summary| !summary.is_empty()), "{name}");
             assert!(operation["operationId"].is_string(), "{name}");
-            let failures = operation["responses"].as_object().unwrap().iter().filter(|(status, _)| status.as_str() >= "400");
+            let failures =
+                operation["responses"].as_object().unwrap().iter().filter(|(status, _)| status.as_str() >= "400");
             for (status, response) in failures.filter(|_| path != "/readyz") {
                 let examples = &response["content"]["application/problem+json"]["examples"];
                 assert!(examples.as_object().is_some_and(|examples| !examples.is_empty()), "{name} {status}");
