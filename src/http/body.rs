@@ -95,7 +95,9 @@ pub async fn read_json<T: DeserializeOwned>(state: &AppState, request: Request) 
         return Err(ApiError::new(ErrorCode::UnsupportedMediaType, detail));
     }
     let (bytes, _held) = read_bytes(state, request, MAX_JSON_BYTES).await?;
-    serde_json::from_slice(&bytes).map_err(json_error)
+    // Through an object, because a struct would also be read from an array.
+    let object: Map<String, Value> = serde_json::from_slice(&bytes).map_err(json_error)?;
+    serde_json::from_value(Value::Object(object)).map_err(json_error)
 }
 
 /// Parses the query string; unknown names are refused by the type.
