@@ -255,3 +255,73 @@ fn write_table<const N: usize>(path: &Path, rows: impl IntoIterator<Item = [Stri
     rows.into_iter().try_for_each(|row| writer.write_record(row)).map_err(fail)?;
     writer.flush().map_err(|source| DatasetError::Write { path: path.to_owned(), source })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::{ImageConfig, decode};
+    use std::collections::{HashMap, HashSet};
+
+    fn options() -> DatasetOptions {
+        let size = ImageSize { width: 48, height: 36 };
+        DatasetOptions { places: 3, views: 2, seed: 4, size, conditions: vec![Condition::Dusk, Condition::Overcast] }
+    }
+
+    fn rows(path: &Path) -> Vec<csv::StringRecord> {
+        csv::Reader::from_path(path).unwrap().records().map(Result::unwrap).collect()
+    }
+
+    #[test]
+    fn a_data_set_is_whole_consistent_and_the_same_twice() {
+        let folders = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+        let summaries = folders.each_ref().map(|folder| write_dataset(folder.path(), &options(), || {}).unwrap());
+        assert_eq!(summaries[0], DatasetSummary { references: 6, queries: 4, unmatched: 1 });
+        let folder = folders[0].path();
+        let positions = rows(&folder.join("positions.csv"));
+        assert_eq!(positions.len(), 10);
+        assert_eq!(image_count(&options()), 10);
+        let mut places = HashMap::new();
+        for row in &positions {
+            let bytes = fs::read(folder.join(&row[0])).unwrap();
+            assert_eq!(bytes, fs::read(folders[1].path().join(&row[0])).unwrap());
+            assert_eq!(decode(&bytes, &ImageConfig::default()).unwrap().size, options().size);
+            let place = GeoPoint::new(row[1].parse().unwrap(), row[2].parse().unwrap()).unwrap();
+            assert!(OffsetDateTime::parse(&row[4], &Rfc3339).is_ok());
+            places.insert(row[0].split_once('/').unwrap().1.to_owned(), place);
+        }
+        let truth = rows(&folder.join("ground_truth.csv"));
+        let queries: HashSet<_> = truth.iter().map(|row| row[0].to_owned()).collect();
+        assert_eq!(queries.len(), 4);
+        for row in truth.iter().filter(|row| !row[1].is_empty()) {
+            assert!(places[&row[0]].distance_m(places[&row[1]]) <= MATCH_RADIUS_M);
+        }
+        for row in truth.iter().filter(|row| row[1].is_empty()) {
+            let far = positions.iter().filter(|position| position[0].starts_with("database/"));
+            let query = places[&row[0]];
+            let name = |position: &csv::StringRecord| position[0].split_once('/').unwrap().1.to_owned();
+            assert!(far.map(|position| places[&name(position)].distance_m(query)).all(|metres| metres > 100.0));
+        }
+    }
+
+    #[test]
+    fn names_carry_the_position_in_utm() {
+        let world = StreetWorld::new(4);
+        let shot = references(world, &options()).remove(0);
+        let fields: Vec<&str> = shot.name.split('@').collect();
+        let number = |i: usize| fields[i].parse::<f64>().unwrap();
+        assert_eq!((fields.len(), fields[3], fields[4], fields[15]), (16, "32", "U", ".jpg"));
+        let (lat, lon) = utm::wsg84_utm_to_lat_lon(number(1), number(2), 32, 'U').unwrap();
+        assert!(GeoPoint::new(lat, lon).unwrap().distance_m(shot.location) < 0.1);
+        assert!((number(9) - shot.heading.degrees()).abs() <= 0.05);
+    }
+
+    #[test]
+    fn nothing_is_written_into_a_folder_with_images_or_without_a_place() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::create_dir_all(folder.path().join("database")).unwrap();
+        fs::write(folder.path().join("database/mine.jpg"), b"keep").unwrap();
+        assert!(matches!(write_dataset(folder.path(), &options(), || {}), Err(DatasetError::NotEmpty(_))));
+        let empty = DatasetOptions { places: 0, ..options() };
+        assert!(matches!(write_dataset(folder.path(), &empty, || {}), Err(DatasetError::Nothing(_))));
+    }
+}

@@ -103,7 +103,7 @@ impl Light {
         let ambient = (self.bounce_colour * (1.0 - upward) + self.sky_colour * upward) * self.openness(position);
         let glow = fragment.glow * if self.condition == Condition::Dusk { 1.0 } else { 0.03 };
         let warm = Vec3::new(1.25, 0.86, 0.46);
-        let own = (warm * 0.75 + albedo * 0.9) * glow;
+        let own = (warm * 0.32 + albedo.component_mul(&warm) * 1.5) * glow;
         let lit = albedo.component_mul(&(sunlight + ambient + self.lamplight(position))) + own;
         let haze = 1.0 - (-fragment.distance / 260.0).exp();
         (lit + (self.haze - lit) * haze).into()
@@ -151,13 +151,13 @@ impl Light {
         let up = direction.y.max(0.0);
         let (zenith, horizon) = match self.condition {
             Condition::Day => ([0.18, 0.36, 0.78], [0.72, 0.82, 0.95]),
-            Condition::Overcast => ([0.72, 0.75, 0.8], [0.88, 0.9, 0.92]),
+            Condition::Overcast => ([0.66, 0.69, 0.73], [0.8, 0.82, 0.84]),
             Condition::Dusk => ([0.05, 0.08, 0.2], [0.5, 0.3, 0.26]),
         };
         let (zenith, horizon) = (Vec3::from(zenith), Vec3::from(horizon));
         let base = horizon + (zenith - horizon) * up.powf(0.55);
         let plane = 1.0 / (up + 0.12);
-        let drift = fractal(self.clouds, direction.x * plane * 1.1, direction.z * plane * 1.1, 5);
+        let drift = fractal(self.clouds, direction.x * plane * 1.1, direction.z * plane * 1.1, 4);
         let (cover, white) = match self.condition {
             Condition::Day => (((drift - 0.5) * 4.0).clamp(0.0, 0.9), Vec3::new(0.98, 0.98, 1.0)),
             Condition::Overcast => (0.8, Vec3::repeat(0.6 + 0.55 * drift)),
@@ -184,7 +184,12 @@ impl Light {
 pub(super) fn develop(frame: &Frame, camera: &Camera, condition: Condition, moment: u64) -> RgbImage {
     let mut dice = Dice::new(&[moment, 0x1e5]);
     let (width, height) = (camera.width / 2, camera.height / 2);
-    let exposure = dice.real(0.85..1.15) * if condition == Condition::Dusk { 1.9 } else { 0.92 };
+    let exposure = dice.real(0.85..1.15)
+        * match condition {
+            Condition::Day => 0.95,
+            Condition::Overcast => 1.5,
+            Condition::Dusk => 1.9,
+        };
     let balance = Vec3::new(dice.real(0.96..1.04), 1.0, dice.real(0.96..1.04));
     let grain = if condition == Condition::Dusk { 0.03 } else { 0.011 };
     let half = frame_halved(frame, width, height);

@@ -97,7 +97,7 @@ impl StreetWorld {
         let light = Light::new(capture.condition, &street, camera.position, capture.moment);
         let mut frame = Frame::new(&camera);
         let traffic = Traffic { seed: capture.moment, density: capture.traffic };
-        let quads = street.quads(camera.position, traffic);
+        let quads = street.quads(&camera, traffic);
         frame.draw(&camera, &quads, &|fragment| light.shade(fragment));
         let horizon = seed_of(&[self.seed, place / PLACES_PER_STREET, 0x5c7]);
         for at in 0..frame.light.len() {
@@ -154,5 +154,80 @@ impl StreetWorld {
         let (pitch, roll) = (0.11 + shake.real(-0.03..0.03), shake.real(-0.02..0.02));
         // Twice the size, for antialiasing.
         Camera::new(position, yaw, pitch, roll, size.width as usize * 2, size.height as usize * 2)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: ImageSize = ImageSize { width: 96, height: 72 };
+    const OBLIQUE: Viewpoint = Viewpoint { along_m: 0.0, across_m: -1.0, turn_deg: 50.0 };
+
+    fn mean(image: &RgbImage) -> f32 {
+        image.pixels.iter().map(|&value| f32::from(value)).sum::<f32>() / image.pixels.len() as f32
+    }
+
+    /// Mean absolute difference of two images of one size.
+    fn difference(a: &RgbImage, b: &RgbImage) -> f32 {
+        a.pixels.iter().zip(&b.pixels).map(|(a, b)| f32::from(a.abs_diff(*b))).sum::<f32>() / a.pixels.len() as f32
+    }
+
+    #[test]
+    fn the_same_arguments_give_the_same_bytes_on_any_thread() {
+        let world = StreetWorld::new(5);
+        let alone = world.render(3, OBLIQUE, Condition::Day, SIZE);
+        let captures = [(3, OBLIQUE, Capture::new(Condition::Day, 1)), (4, OBLIQUE, Capture::new(Condition::Dusk, 2))];
+        assert_eq!(world.render(3, OBLIQUE, Condition::Day, SIZE), alone);
+        assert_eq!(world.render_all(&captures, SIZE), world.render_all(&captures, SIZE));
+        assert_eq!(
+            world.render_all(&captures, SIZE)[1],
+            world.render_capture(captures[1].0, OBLIQUE, captures[1].2, SIZE)
+        );
+    }
+
+    #[test]
+    fn places_seeds_and_sides_differ_more_than_moments() {
+        let day = Capture { traffic: 0.0, ..Capture::new(Condition::Overcast, 1) };
+        let later = Capture { moment: 2, ..day };
+        let world = StreetWorld::new(5);
+        let here = world.render_capture(3, OBLIQUE, day, SIZE);
+        let again = difference(&here, &world.render_capture(3, OBLIQUE, later, SIZE));
+        assert!(again > 0.5, "another moment is another picture");
+        let left = Viewpoint { turn_deg: -50.0, ..OBLIQUE };
+        for other in [
+            world.render_capture(4, OBLIQUE, day, SIZE),
+            world.render_capture(3, left, day, SIZE),
+            StreetWorld::new(6).render_capture(3, OBLIQUE, day, SIZE),
+        ] {
+            assert!(difference(&here, &other) > again + 4.0);
+        }
+    }
+
+    #[test]
+    fn dusk_is_darker_and_pictures_are_never_flat() {
+        let world = StreetWorld::new(9);
+        let [day, dusk, overcast] = Condition::ALL.map(|condition| world.render(1, OBLIQUE, condition, SIZE));
+        assert!(mean(&dusk) + 20.0 < mean(&day).min(mean(&overcast)));
+        for image in [day, dusk, overcast] {
+            assert_eq!((image.size, image.pixels.len()), (SIZE, 96 * 72 * 3));
+            let centre = mean(&image);
+            let spread = image.pixels.iter().map(|&v| (f32::from(v) - centre).powi(2)).sum::<f32>();
+            assert!((spread / image.pixels.len() as f32).sqrt() > 15.0);
+        }
+    }
+
+    #[test]
+    fn positions_follow_the_metres_and_headings_the_turn() {
+        let world = StreetWorld::new(1);
+        let ahead = Viewpoint { along_m: 0.0, across_m: 0.0, turn_deg: 0.0 };
+        let metres = |a: u64, b: u64| world.position(a, ahead).distance_m(world.position(b, ahead));
+        assert!((metres(0, 1) - 45.0).abs() < 0.1, "{}", metres(0, 1));
+        assert!((metres(0, 8) - 160.0).abs() < 0.5, "{}", metres(0, 8));
+        let south = Viewpoint { across_m: 2.0, ..ahead };
+        assert!(world.position(0, south).lat() < world.position(0, ahead).lat());
+        assert_eq!(world.heading(ahead).degrees(), 90.0);
+        assert_eq!(world.heading(Viewpoint { turn_deg: -100.0, ..ahead }).degrees(), 350.0);
+        assert!(world.position(u64::MAX, ahead).lat().is_finite());
     }
 }

@@ -40,7 +40,7 @@ pub(super) fn paint_tree(size: [f32; 2], scale: f32, seed: u64) -> Painting {
             tree.ellipse(centre, [radius, radius * 0.8], dice.vary(shaded(green, shade), 9.0), 0.96);
         }
     }
-    tree.modulate(|x, y| 0.75 + 0.5 * lattice(seed, (x * 9.0) as i32, (y * 9.0) as i32));
+    tree.modulate(|x, y| 0.75 + 0.5 * lattice(seed, (x * 22.0) as i32, (y * 22.0) as i32));
     tree
 }
 
@@ -101,130 +101,91 @@ pub(super) fn paint_hanging_sign(accent: [u8; 3], scale: f32, seed: u64) -> Pain
     sign
 }
 
-/// The side of a car or van, nose to the right; metres.
-pub(super) fn paint_vehicle_side(
-    length: f32,
-    height: f32,
-    van: bool,
+/// The outline of a vehicle from its tail over the roof to its nose, in shares of length and height (down from the
+/// top), and whether the panel up to the next point is glass.
+pub(super) type Outline = [([f32; 2], bool)];
+
+/// A saloon car.
+pub(super) const CAR: &Outline = &[
+    ([0.0, 0.88], false),
+    ([0.01, 0.5], false),
+    ([0.14, 0.42], true),
+    ([0.27, 0.03], false),
+    ([0.6, 0.03], true),
+    ([0.75, 0.42], false),
+    ([0.97, 0.52], false),
+    ([1.0, 0.88], false),
+];
+
+/// A delivery van.
+pub(super) const VAN: &Outline = &[
+    ([0.0, 0.9], false),
+    ([0.0, 0.08], false),
+    ([0.03, 0.03], false),
+    ([0.72, 0.03], true),
+    ([0.86, 0.42], false),
+    ([0.98, 0.52], false),
+    ([1.0, 0.9], false),
+];
+
+/// The flank of a vehicle, nose to the right; metres.
+pub(super) fn paint_flank(
+    outline: &Outline,
+    [length, height]: [f32; 2],
     colour: [u8; 3],
     scale: f32,
     seed: u64,
 ) -> Painting {
-    let mut side = Painting::new(length, height, scale);
+    let mut flank = Painting::new(length, height, scale);
     let mut dice = Dice::new(&[seed, 7]);
-    let sill = height - 0.32;
     let glass = [48, 58, 68];
-    if van {
-        side.polygon(
-            &[
-                [0.05, 0.1],
-                [length * 0.72, 0.05],
-                [length * 0.86, height * 0.42],
-                [length - 0.05, height * 0.52],
-                [length, sill],
-                [0.0, sill],
-            ],
-            colour,
-        );
-        side.polygon(
-            &[
-                [length * 0.66, 0.25],
-                [length * 0.73, 0.25],
-                [length * 0.83, height * 0.44],
-                [length * 0.66, height * 0.44],
-            ],
-            glass,
-        );
+    let at = |x: f32, y: f32| [length * x, height * y];
+    let points: Vec<[f32; 2]> = outline.iter().map(|([x, y], _)| at(*x, *y)).collect();
+    flank.polygon(&points, colour);
+    if outline.len() == VAN.len() {
+        flank.polygon(&[at(0.66, 0.12), at(0.73, 0.12), at(0.83, 0.42), at(0.66, 0.42)], glass);
+        flank.rect(length * 0.64, height * 0.1, 0.03, height * 0.75, shaded(colour, 0.7));
         if dice.chance(0.7) {
-            let ink = dice.pick(&[[240, 240, 240], [30, 40, 90], [180, 40, 40]]);
-            paint_lettering(
-                &mut side,
-                [length * 0.12, height * 0.25],
-                [length * 0.45, height * 0.2],
-                ink,
-                dice.whole(4..9),
-                &mut dice,
-            );
+            let ink = dice.pick(&[[240, 240, 240], [30, 40, 90], [180, 40, 40], [40, 40, 44]]);
+            let letters = dice.whole(4..9);
+            paint_lettering(&mut flank, at(0.1, 0.25), at(0.45, 0.2), ink, letters, &mut dice);
         }
     } else {
-        side.polygon(
-            &[
-                [0.0, height * 0.5],
-                [length * 0.16, height * 0.42],
-                [length * 0.28, 0.03],
-                [length * 0.62, 0.03],
-                [length * 0.76, height * 0.42],
-                [length * 0.97, height * 0.52],
-                [length, sill],
-                [0.0, sill],
-            ],
-            colour,
-        );
-        side.polygon(
-            &[
-                [length * 0.21, height * 0.42],
-                [length * 0.31, 0.12],
-                [length * 0.45, 0.12],
-                [length * 0.45, height * 0.42],
-            ],
-            glass,
-        );
-        side.polygon(
-            &[
-                [length * 0.48, 0.12],
-                [length * 0.6, 0.12],
-                [length * 0.71, height * 0.42],
-                [length * 0.48, height * 0.42],
-            ],
-            glass,
-        );
+        flank.polygon(&[at(0.2, 0.42), at(0.3, 0.11), at(0.44, 0.11), at(0.44, 0.42)], glass);
+        flank.polygon(&[at(0.47, 0.11), at(0.58, 0.11), at(0.7, 0.42), at(0.47, 0.42)], glass);
+        flank.rect(length * 0.455, height * 0.42, 0.02, height * 0.4, shaded(colour, 0.7));
     }
-    side.tint(0.0, height * 0.56, length, 0.04, [0, 0, 0], 0.3);
-    side.rect(0.02, sill - 0.16, length - 0.04, 0.16, shaded(colour, 0.55));
+    flank.tint(length * 0.01, height * 0.57, length * 0.97, 0.04, [0, 0, 0], 0.3);
+    flank.rect(length * 0.02, height * 0.8, length * 0.96, height * 0.09, shaded(colour, 0.55));
     for axle in [length * 0.19, length * 0.81] {
-        side.ellipse([axle, height - 0.31], [0.31, 0.31], [26, 26, 28], 1.0);
-        side.ellipse([axle, height - 0.31], [0.17, 0.17], [140, 142, 146], 1.0);
+        flank.ellipse([axle, height - 0.34], [0.38, 0.38], [18, 18, 20], 1.0);
+        flank.ellipse([axle, height - 0.31], [0.31, 0.31], [28, 28, 30], 1.0);
+        flank.ellipse([axle, height - 0.31], [0.17, 0.17], [140, 142, 146], 1.0);
     }
-    side.rect(length - 0.14, height * 0.58, 0.12, 0.12, [240, 236, 210]);
-    side.rect(0.02, height * 0.56, 0.1, 0.14, [170, 24, 28]);
-    side
+    flank.rect(length * 0.97, height * 0.58, length * 0.02, 0.12, [240, 236, 210]);
+    flank.rect(length * 0.012, height * 0.56, 0.1, 0.14, [170, 24, 28]);
+    flank
 }
 
-/// The front or back of a vehicle.
-pub(super) fn paint_vehicle_end(
-    width: f32,
-    height: f32,
-    van: bool,
-    colour: [u8; 3],
-    scale: f32,
-    seed: u64,
-) -> Painting {
+/// The tail or the nose of a vehicle: lamps, number plate, bumper.
+pub(super) fn paint_end([width, height]: [f32; 2], colour: [u8; 3], lamps: [u8; 3], scale: f32, seed: u64) -> Painting {
     let mut end = Painting::new(width, height, scale);
     let mut dice = Dice::new(&[seed, 8]);
-    let top = if van { 0.08 } else { 0.03 };
-    end.polygon(
-        &[
-            [0.2, top],
-            [width - 0.2, top],
-            [width - 0.03, height * 0.45],
-            [width, height - 0.2],
-            [0.0, height - 0.2],
-            [0.03, height * 0.45],
-        ],
-        colour,
-    );
-    end.polygon(
-        &[[0.28, height * 0.12], [width - 0.28, height * 0.12], [width - 0.14, height * 0.42], [0.14, height * 0.42]],
-        [52, 62, 72],
-    );
-    end.rect(0.04, height * 0.54, 0.22, 0.14, [186, 30, 32]);
-    end.rect(width - 0.26, height * 0.54, 0.22, 0.14, [186, 30, 32]);
-    end.rect(width / 2.0 - 0.26, height * 0.66, 0.52, 0.12, [236, 236, 230]);
-    paint_lettering(&mut end, [width / 2.0 - 0.22, height * 0.66 + 0.02], [0.44, 0.08], [20, 20, 24], 6, &mut dice);
-    end.rect(0.02, height - 0.32, width - 0.04, 0.14, shaded(colour, 0.45));
-    for left in [0.08, width - 0.3] {
-        end.rect(left, height - 0.26, 0.22, 0.26, [24, 24, 26]);
+    end.rect(0.0, 0.0, width, height, colour);
+    if height > 1.2 {
+        // A van's back doors.
+        end.rect(width / 2.0 - 0.01, 0.1, 0.03, height - 0.3, shaded(colour, 0.6));
+        for left in [0.2, width / 2.0 + 0.12] {
+            end.rect(left, height * 0.12, width / 2.0 - 0.32, height * 0.25, [52, 62, 72]);
+        }
     }
+    let belt = (height - 0.5).max(0.05);
+    for left in [0.04, width - 0.28] {
+        end.rect(left, belt, 0.24, 0.15, lamps);
+    }
+    end.rect(width / 2.0 - 0.27, height - 0.34, 0.54, 0.13, [236, 236, 230]);
+    paint_lettering(&mut end, [width / 2.0 - 0.23, height - 0.32], [0.46, 0.09], [20, 20, 24], 6, &mut dice);
+    end.rect(0.0, height - 0.17, width, 0.17, shaded(colour, 0.45));
     end
 }
 
@@ -253,18 +214,22 @@ pub(super) fn paint_person(scale: f32, seed: u64) -> Painting {
     person
 }
 
-/// A stretch of road with pavements, `length` by twice `half_width` metres; x runs along the street.
-pub(super) fn paint_ground(
-    length: f32,
-    half_width: f32,
-    pavement: f32,
-    cobbles: bool,
-    scale: f32,
-    seed: u64,
-) -> Painting {
+/// A stretch of road with its pavements; metres.
+pub(super) struct GroundPlan {
+    /// Where it begins along the street.
+    pub start: f32,
+    pub length: f32,
+    pub half_width: f32,
+    pub pavement: f32,
+    pub cobbles: bool,
+}
+
+/// Paints a stretch of road, x along the street; `seeds` are the street's and the stretch's own.
+pub(super) fn paint_ground(plan: &GroundPlan, scale: f32, [street, stretch]: [u64; 2]) -> Painting {
+    let GroundPlan { start, length, half_width, pavement, cobbles } = *plan;
     let width = half_width * 2.0;
     let mut ground = Painting::new(length, width, scale);
-    let mut dice = Dice::new(&[seed, 11]);
+    let mut dice = Dice::new(&[stretch, 11]);
     ground.rect(0.0, 0.0, length, width, [92, 92, 94]);
     for top in [0.0, width - pavement] {
         ground.rect(0.0, top, length, pavement, [150, 146, 138]);
@@ -272,26 +237,30 @@ pub(super) fn paint_ground(
     for top in [pavement - 0.14, width - pavement] {
         ground.rect(0.0, top, length, 0.14, [178, 174, 166]);
     }
-    for _ in 0..(length / 9.0) as usize {
-        let (x, y) = (dice.real(0.0..length), dice.real(pavement + 0.5..width - pavement - 1.5));
+    for _ in 0..dice.whole(0..3) {
+        let (x, y) = (dice.real(0.0..length - 4.0), dice.real(pavement + 0.5..width - pavement - 1.5));
         ground.tint(x, y, dice.real(0.8..4.0), dice.real(0.5..1.4), [40, 40, 42], 0.45);
     }
     if !cobbles {
-        (0..(length / 6.0) as usize)
-            .for_each(|i| ground.rect(i as f32 * 6.0, half_width - 0.06, 3.0, 0.12, [206, 204, 196]));
+        // Stretches are as long as two dashes with their gaps.
+        [0.0, length / 2.0]
+            .into_iter()
+            .for_each(|x| ground.rect(x, half_width - 0.06, length / 4.0, 0.12, [206, 204, 196]));
     }
-    for _ in 0..(length / 14.0) as usize {
-        let at = [dice.real(0.0..length), dice.real(pavement..width - pavement)];
+    if dice.chance(0.7) {
+        let at = [dice.real(1.0..length - 1.0), dice.real(pavement + 0.5..width - pavement - 0.5)];
         ground.ellipse(at, [0.35, 0.35], [62, 60, 58], 1.0);
+        ground.ellipse(at, [0.28, 0.28], [78, 76, 74], 1.0);
     }
     ground.modulate(|x, y| {
+        let x = x + start;
         let on_road = y > pavement && y < width - pavement;
-        let wear = 0.82 + 0.36 * fractal(seed, x * 0.4, y * 0.8, 4);
-        let grain = 0.88 + 0.24 * lattice(seed ^ 1, (x * 24.0) as i32, (y * 24.0) as i32);
+        let wear = 0.82 + 0.36 * fractal(street, x * 0.4, y * 0.8, 3);
+        let grain = 0.88 + 0.24 * lattice(street ^ 1, (x * 24.0) as i32, (y * 24.0) as i32);
         let joints = match (on_road, cobbles) {
             (true, false) => 1.0,
-            (true, true) => paving(seed, x, y, 0.22),
-            (false, _) => paving(seed, x, y, 0.6),
+            (true, true) => paving(street, x, y, 0.22),
+            (false, _) => paving(street, x, y, 0.6),
         };
         wear * grain * joints
     });

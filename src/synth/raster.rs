@@ -41,18 +41,6 @@ pub(super) struct Quad {
 }
 
 impl Quad {
-    /// An upright rectangle from `foot_a` to `foot_b` (as seen: left to right), `height` tall.
-    pub(super) fn upright(foot_a: Vec3, foot_b: Vec3, height: f32, texture: Arc<Texture>, surface: Surface) -> Self {
-        let origin = foot_a + Vec3::new(0.0, height, 0.0);
-        Self { origin, across: foot_b - foot_a, down: Vec3::new(0.0, -height, 0.0), texture, surface, cutout: false }
-    }
-
-    /// The same, with holes where its texture is transparent.
-    pub(super) fn with_cutout(mut self) -> Self {
-        self.cutout = true;
-        self
-    }
-
     fn centre(&self) -> Vec3 {
         self.origin + (self.across + self.down) * 0.5
     }
@@ -98,21 +86,25 @@ impl Camera {
         Vec3::new(offset.dot(&self.right), -offset.dot(&self.up), offset.dot(&self.forward))
     }
 
-    /// Where `point` falls in the image, unless it is behind the camera.
-    pub(super) fn project(&self, point: Vec3) -> Option<[f32; 2]> {
-        let view = self.view(point);
-        (view.z > NEAR_M).then(|| self.on_image(view))
-    }
-
     fn on_image(&self, view: Vec3) -> [f32; 2] {
         let scale = self.focal / view.z;
         [view.x * scale + self.width as f32 / 2.0, view.y * scale + self.height as f32 / 2.0]
     }
 
-    /// The pixels that `quad` may cover: columns and rows, ends excluded.
-    fn bounds(&self, quad: &Quad) -> Option<[usize; 4]> {
-        let corners = [Vec3::zeros(), quad.across, quad.across + quad.down, quad.down];
-        let corners = corners.map(|offset| self.view(quad.origin + offset));
+    /// Whether the rectangle may cover any pixel.
+    pub(super) fn sees(&self, origin: Vec3, across: Vec3, down: Vec3) -> bool {
+        self.bounds(origin, across, down).is_some()
+    }
+
+    /// How many pixels a metre spans at `distance`.
+    pub(super) fn pixels_per_metre(&self, distance: f32) -> f32 {
+        self.focal / distance
+    }
+
+    /// The pixels that a rectangle may cover: columns and rows, ends excluded.
+    fn bounds(&self, origin: Vec3, across: Vec3, down: Vec3) -> Option<[usize; 4]> {
+        let corners = [Vec3::zeros(), across, across + down, down];
+        let corners = corners.map(|offset| self.view(origin + offset));
         let mut bounds = [f32::MAX, f32::MIN, f32::MAX, f32::MIN];
         let mut include = |view: Vec3| {
             let [x, y] = self.on_image(view);
@@ -173,20 +165,17 @@ impl Frame {
         1.0 / self.inverse_depth[at]
     }
 
-    /// Draws all of `quads`: opaque ones in any order, cutouts far to near.
+    /// Draws all of `quads`: opaque ones near to far, so that little is shaded in vain, then cutouts far to near.
     pub(super) fn draw(&mut self, camera: &Camera, quads: &[Quad], shade: &impl Fn(&Fragment) -> [f32; 3]) {
-        quads.iter().filter(|quad| !quad.cutout).for_each(|quad| self.draw_quad(camera, quad, shade));
-        let mut cutouts: Vec<(f32, &Quad)> = quads
-            .iter()
-            .filter(|quad| quad.cutout)
-            .map(|quad| ((quad.centre() - camera.position).norm_squared(), quad))
-            .collect();
-        cutouts.sort_by(|a, b| b.0.total_cmp(&a.0));
-        cutouts.into_iter().for_each(|(_, quad)| self.draw_quad(camera, quad, shade));
+        let distance = |quad: &Quad| (quad.centre() - camera.position).norm_squared();
+        let (mut cutouts, mut opaque): (Vec<&Quad>, Vec<&Quad>) = quads.iter().partition(|quad| quad.cutout);
+        opaque.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
+        cutouts.sort_by(|a, b| distance(b).total_cmp(&distance(a)));
+        opaque.into_iter().chain(cutouts).for_each(|quad| self.draw_quad(camera, quad, shade));
     }
 
     fn draw_quad(&mut self, camera: &Camera, quad: &Quad, shade: &impl Fn(&Fragment) -> [f32; 3]) {
-        let Some([left, right, top, bottom]) = camera.bounds(quad) else { return };
+        let Some([left, right, top, bottom]) = camera.bounds(quad.origin, quad.across, quad.down) else { return };
         let Some(map) = PixelToQuad::new(camera, quad) else { return };
         let mut normal = quad.across.cross(&quad.down).normalize();
         if normal.dot(&(camera.position - quad.origin)) < 0.0 {
@@ -265,6 +254,84 @@ impl PixelToQuad {
             du.hypot(dv)
         };
         let (a, b) = (step(self.per_x), step(self.per_y));
-        (a.max(b).powf(0.6) * a.min(b).powf(0.4)).max(1e-3)
+        let (long, short) = (a.max(b), a.min(b));
+        // long^(3/4) * short^(1/4)
+        (long * (long * short).sqrt()).sqrt().max(1e-3)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::paint::Painting;
+    use super::*;
+
+    fn upright(left: Vec3, right: Vec3, height: f32, texture: Arc<Texture>) -> Quad {
+        let (origin, down) = (left + Vec3::new(0.0, height, 0.0), Vec3::new(0.0, -height, 0.0));
+        Quad { origin, across: right - left, down, texture, surface: Surface::Wall, cutout: false }
+    }
+
+    /// Left half red, right half green, upper quarter blue.
+    fn quad() -> Quad {
+        let mut painting = Painting::new(4.0, 4.0, 32.0);
+        painting.rect(0.0, 0.0, 2.0, 4.0, [255, 0, 0]);
+        painting.rect(2.0, 0.0, 2.0, 4.0, [0, 255, 0]);
+        painting.rect(0.0, 0.0, 4.0, 1.0, [0, 0, 255]);
+        let texture = Arc::new(Texture::new(&painting));
+        upright(Vec3::new(6.0, 0.0, -2.0), Vec3::new(8.0, 0.0, 1.464), 4.0, texture)
+    }
+
+    fn camera() -> Camera {
+        Camera::new(Vec3::new(0.0, 1.6, 0.3), 0.1, 0.05, 0.02, 320, 240)
+    }
+
+    fn project(camera: &Camera, point: Vec3) -> [f32; 2] {
+        camera.on_image(camera.view(point))
+    }
+
+    #[test]
+    fn pixels_map_back_to_the_points_projected_on_them() {
+        let (quad, camera) = (quad(), camera());
+        let map = PixelToQuad::new(&camera, &quad).unwrap();
+        for (u, v) in [(0.01, 0.01), (0.5, 0.5), (0.9, 0.2), (0.3, 0.99)] {
+            let point = quad.origin + quad.across * u + quad.down * v;
+            let [x, y] = project(&camera, point);
+            let (found_u, found_v, inverse_depth) = map.at(x, y).unwrap();
+            assert!((found_u - u).abs() < 1e-3 && (found_v - v).abs() < 1e-3);
+            assert!((1.0 / inverse_depth - camera.view(point).z).abs() < 1e-2);
+        }
+    }
+
+    #[test]
+    fn what_is_drawn_lies_where_it_projects_and_the_nearer_wins() {
+        let (far, camera) = (quad(), camera());
+        let mut wall = Painting::new(1.0, 1.0, 8.0);
+        wall.rect(0.0, 0.0, 1.0, 1.0, [255, 255, 255]);
+        let near = upright(Vec3::new(4.0, 0.0, 0.0), Vec3::new(4.0, 0.0, 1.0), 1.0, Arc::new(Texture::new(&wall)));
+        let mut frame = Frame::new(&camera);
+        frame.draw(&camera, &[near.clone(), far.clone()], &|fragment| fragment.albedo);
+        let at = |quad: &Quad, u: f32, v: f32| {
+            let [x, y] = project(&camera, quad.origin + quad.across * u + quad.down * v);
+            frame.light[y as usize * camera.width + x as usize].map(|channel| channel > 0.5)
+        };
+        assert_eq!(at(&far, 0.1, 0.5), [true, false, false]);
+        assert_eq!(at(&far, 0.9, 0.5), [false, true, false]);
+        assert_eq!(at(&far, 0.4, 0.1), [false, false, true]);
+        assert_eq!(at(&near, 0.5, 0.5), [true, true, true]);
+        assert!(frame.depth(0).is_infinite());
+    }
+
+    #[test]
+    fn quads_behind_or_edge_on_draw_nothing_and_crossing_ones_are_cut() {
+        let camera = Camera::new(Vec3::zeros(), 0.0, 0.0, 0.0, 64, 48);
+        let texture = quad().texture;
+        let behind = upright(Vec3::new(-3.0, -1.0, -1.0), Vec3::new(-3.0, -1.0, 1.0), 2.0, texture.clone());
+        let edge_on = upright(Vec3::new(1.0, -1.0, 0.0), Vec3::new(3.0, -1.0, 0.0), 2.0, texture.clone());
+        let mut frame = Frame::new(&camera);
+        frame.draw(&camera, &[behind, edge_on], &|_| [1.0; 3]);
+        assert!(frame.light.iter().all(|light| *light == [0.0; 3]));
+        let passing = upright(Vec3::new(-5.0, -1.0, 1.0), Vec3::new(50.0, -1.0, 1.0), 2.0, texture);
+        frame.draw(&camera, &[passing], &|_| [1.0; 3]);
+        let lit = |x: usize| frame.light[24 * 64 + x] == [1.0; 3];
+        assert!(lit(63) && lit(40) && !lit(30), "the wall fills the right of the picture");
     }
 }
