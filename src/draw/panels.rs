@@ -259,7 +259,7 @@ mod tests {
 
     #[test]
     fn key_patches_are_outlined_in_the_colour_of_their_scale() {
-        let (image, patches) = (grey(), patches(vec![0, 0, 15], [0, 1, 1]));
+        let (image, patches) = (grey(), patches(vec![0, 15], [0, 1, 1]));
         let side = MatchSide { image: &image, attention: None, patches: &patches };
         let picture = match_picture(&side, &side, &[]).unwrap();
         // The first 2x2 window spans 30 x 30 pixels of the panel at 8, 8; its outline is inset by 1.5.

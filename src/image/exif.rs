@@ -59,7 +59,7 @@ fn location(exif: &Exif) -> Option<GeoPoint> {
 /// Degrees, minutes and seconds as signed degrees.
 fn angle(exif: &Exif, value: Tag, reference: Tag, negative: char) -> Option<f64> {
     let parts = rationals(exif, value)?;
-    let [degrees, minutes, seconds] = std::array::from_fn(|i| parts.get(i).map_or(Some(0.0), |part| finite(part)));
+    let [degrees, minutes, seconds] = std::array::from_fn(|i| parts.get(i).map_or(Some(0.0), finite));
     let magnitude = degrees? + minutes? / 60.0 + seconds? / 3600.0;
     let sign = if ascii(exif, reference)?.starts_with(negative) { -1.0 } else { 1.0 };
     Some(sign * magnitude)

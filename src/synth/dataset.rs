@@ -264,7 +264,7 @@ mod tests {
 
     fn options() -> DatasetOptions {
         let size = ImageSize { width: 48, height: 36 };
-        DatasetOptions { places: 3, views: 2, seed: 4, size, conditions: vec![Condition::Dusk, Condition::Overcast] }
+        DatasetOptions { places: 2, views: 1, seed: 4, size, conditions: vec![Condition::Dusk, Condition::Overcast] }
     }
 
     fn rows(path: &Path) -> Vec<csv::StringRecord> {
@@ -275,11 +275,11 @@ mod tests {
     fn a_data_set_is_whole_consistent_and_the_same_twice() {
         let folders = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
         let summaries = folders.each_ref().map(|folder| write_dataset(folder.path(), &options(), || {}).unwrap());
-        assert_eq!(summaries[0], DatasetSummary { references: 6, queries: 4, unmatched: 1 });
+        assert_eq!(summaries[0], DatasetSummary { references: 2, queries: 3, unmatched: 1 });
         let folder = folders[0].path();
         let positions = rows(&folder.join("positions.csv"));
-        assert_eq!(positions.len(), 10);
-        assert_eq!(image_count(&options()), 10);
+        assert_eq!(positions.len(), 5);
+        assert_eq!(image_count(&options()), 5);
         let mut places = HashMap::new();
         for row in &positions {
             let bytes = fs::read(folder.join(&row[0])).unwrap();
@@ -291,7 +291,7 @@ mod tests {
         }
         let truth = rows(&folder.join("ground_truth.csv"));
         let queries: HashSet<_> = truth.iter().map(|row| row[0].to_owned()).collect();
-        assert_eq!(queries.len(), 4);
+        assert_eq!(queries.len(), 3);
         for row in truth.iter().filter(|row| !row[1].is_empty()) {
             assert!(places[&row[0]].distance_m(places[&row[1]]) <= MATCH_RADIUS_M);
         }
