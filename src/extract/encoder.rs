@@ -2,8 +2,10 @@
 
 use super::error::ExtractError;
 use super::preset::Geometry;
-use crate::types::{ImageSize, ImageTensor};
+use crate::types::{ImageSize, ImageTensor, InvalidValue};
 use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
 
 /// Which part of the transformer an encoder computes. Blocks beyond the last one named here are never run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -92,6 +94,36 @@ pub enum Precision {
     Bf16,
     /// 8-bit integer products, 32-bit sums.
     Int8,
+}
+
+impl Precision {
+    /// Its name in settings.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::F32 => "f32",
+            Self::Bf16 => "bf16",
+            Self::Int8 => "int8",
+        }
+    }
+}
+
+impl fmt::Display for Precision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Precision {
+    type Err = InvalidValue;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let known = [Self::Auto, Self::F32, Self::Bf16, Self::Int8];
+        known
+            .into_iter()
+            .find(|precision| precision.name() == text)
+            .ok_or_else(|| InvalidValue::new("precision", format!("{text:?} is not one of auto, f32, bf16, int8")))
+    }
 }
 
 /// Refuses an image whose size or length is not what the spec and `geometry` need.

@@ -129,18 +129,18 @@ impl Head {
 
     /// The global descriptor `[256]` of an L2-normalised pooled token `[dim]`.
     pub fn project(&self, pooled: &[f32]) -> Vec<f32> {
-        assert_eq!(pooled.len(), self.dim, "a head takes tokens of its own width");
-        let mut global: Vec<f32> = self
-            .weight
-            .chunks_exact(self.dim)
-            .zip(&self.bias)
-            .map(|(row, bias)| {
-                let sum: f64 = row.iter().zip(pooled).map(|(&w, &x)| w as f64 * x as f64).sum();
-                (sum + *bias as f64) as f32
-            })
-            .collect();
+        let mut global: Vec<f32> = self.affine(pooled).iter().map(|&value| value as f32).collect();
         l2_normalise(&mut global);
         global
+    }
+
+    /// W x + b, before normalisation.
+    pub(super) fn affine(&self, pooled: &[f32]) -> Vec<f64> {
+        assert_eq!(pooled.len(), self.dim, "a head takes tokens of its own width");
+        let row = |(row, &bias): (&[f32], &f32)| {
+            row.iter().zip(pooled).map(|(&w, &x)| w as f64 * x as f64).sum::<f64>() + bias as f64
+        };
+        self.weight.chunks_exact(self.dim).zip(&self.bias).map(row).collect()
     }
 }
 

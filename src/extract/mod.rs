@@ -11,6 +11,7 @@
 //! [`CandleEncoder`] is the plain implementation it is tested against.
 
 mod activation;
+pub mod batcher;
 mod config;
 mod encoder;
 mod error;
@@ -19,6 +20,7 @@ mod fused;
 mod fusion;
 mod global;
 mod head;
+mod pca;
 mod positions;
 mod preset;
 pub mod pull;
@@ -36,6 +38,7 @@ pub use fused::FusedEncoder;
 pub use fusion::{attention_map, average_pool};
 pub use global::{l2_normalise, mean_token};
 pub use head::Head;
+pub use pca::Covariance;
 pub use positions::interpolate as interpolate_positions;
 pub use preset::{Geometry, LAYER_NORM_EPS, Preset};
 pub use record::{Record, verify as verify_weights};

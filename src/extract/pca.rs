@@ -1,0 +1,129 @@
+//! Fits a head without labels: PCA of pooled tokens to 256 components with half whitening.
+//!
+//! Components are divided by the square root of their standard deviation, half way between plain PCA, in which a few
+//! strong components drown the rest, and full whitening, which raises the noise of the weak ones. The covariance is
+//! gathered image by image, so the number of images does not matter to memory.
+
+use super::error::ExtractError;
+use super::head::Head;
+use crate::types::GLOBAL_DIM;
+use nalgebra::{DMatrix, SymmetricEigen};
+use std::collections::BTreeMap;
+
+/// Mean and covariance of vectors seen one at a time (Welford's update, in f64).
+#[derive(Debug, Clone)]
+pub struct Covariance {
+    count: usize,
+    mean: Vec<f64>,
+    /// Sum of outer products of deviations, lower triangle filled, `[dim, dim]` row-major.
+    scatter: Vec<f64>,
+}
+
+impl Covariance {
+    /// Of vectors of length `dim`.
+    pub fn new(dim: usize) -> Self {
+        Self { count: 0, mean: vec![0.0; dim], scatter: vec![0.0; dim * dim] }
+    }
+
+    /// Adds one vector.
+    pub fn add(&mut self, vector: &[f32]) {
+        let dim = self.mean.len();
+        assert_eq!(vector.len(), dim, "all vectors have one length");
+        self.count += 1;
+        let before: Vec<f64> = vector.iter().zip(&self.mean).map(|(&v, mean)| v as f64 - mean).collect();
+        let count = self.count as f64;
+        self.mean.iter_mut().zip(&before).for_each(|(mean, d)| *mean += d / count);
+        let shrink = (count - 1.0) / count;
+        for (i, row) in self.scatter.chunks_exact_mut(dim).enumerate() {
+            let factor = before[i] * shrink;
+            row[..=i].iter_mut().zip(&before).for_each(|(sum, d)| *sum += factor * d);
+        }
+    }
+
+    /// Vectors seen.
+    pub fn count(&self) -> usize {
+        self.count
+    }
+
+    fn matrix(&self) -> DMatrix<f64> {
+        let dim = self.mean.len();
+        let n = (self.count.max(2) - 1) as f64;
+        DMatrix::from_fn(dim, dim, |r, c| self.scatter[r.max(c) * dim + r.min(c)] / n)
+    }
+
+    /// The head for `backbone` whose rows are the 256 strongest components, each divided by sigma^0.5.
+    ///
+    /// Signs are fixed (the largest entry of a component is positive), so equal input gives an equal file.
+    pub fn half_whitened_head(&self, backbone: &str, notes: BTreeMap<String, String>) -> Result<Head, ExtractError> {
+        if self.count <= GLOBAL_DIM {
+            return Err(ExtractError::TooFewImages { dim: GLOBAL_DIM, images: self.count });
+        }
+        let eigen = SymmetricEigen::new(self.matrix());
+        let mut order: Vec<usize> = (0..self.mean.len()).collect();
+        order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+        // Directions without variance carry rounding noise only; a floor keeps them from being blown up.
+        let floor = eigen.eigenvalues.max() * 1e-9;
+        let (mut weight, mut bias) = (Vec::with_capacity(GLOBAL_DIM * self.mean.len()), Vec::with_capacity(GLOBAL_DIM));
+        for &component in order.iter().take(GLOBAL_DIM) {
+            let direction = eigen.eigenvectors.column(component);
+            let sign = direction.iter().copied().max_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(1.0).signum();
+            let scale = sign * eigen.eigenvalues[component].max(floor).powf(-0.25);
+            weight.extend(direction.iter().map(|v| (v * scale) as f32));
+            bias.push(-direction.iter().zip(&self.mean).map(|(v, mean)| v * scale * mean).sum::<f64>() as f32);
+        }
+        Head::new(weight, bias, backbone, notes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    const DIM: usize = 300;
+
+    /// Vectors whose coordinate i has deviation 1 / (1 + i) around a mean of i.
+    fn sample(count: usize) -> Vec<Vec<f32>> {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let mut gauss = || (0..12).map(|_| rng.random::<f32>()).sum::<f32>() - 6.0;
+        (0..count).map(|_| (0..DIM).map(|i| i as f32 * 0.01 + gauss() / (1 + i) as f32).collect()).collect()
+    }
+
+    #[test]
+    fn the_streamed_covariance_is_the_covariance() {
+        let vectors = sample(50);
+        let mut streamed = Covariance::new(DIM);
+        vectors.iter().for_each(|v| streamed.add(v));
+        let mean = |i: usize| vectors.iter().map(|v| v[i] as f64).sum::<f64>() / 50.0;
+        for (r, c) in [(0, 0), (3, 1), (1, 3), (299, 299)] {
+            let (mr, mc) = (mean(r), mean(c));
+            let direct = vectors.iter().map(|v| (v[r] as f64 - mr) * (v[c] as f64 - mc)).sum::<f64>() / 49.0;
+            assert!((streamed.matrix()[(r, c)] - direct).abs() < 1e-10);
+        }
+    }
+
+    #[test]
+    fn components_are_centred_uncorrelated_and_half_whitened() {
+        let vectors = sample(2000);
+        let mut covariance = Covariance::new(DIM);
+        vectors.iter().for_each(|v| covariance.add(v));
+        let head = covariance.half_whitened_head("x", BTreeMap::new()).unwrap();
+        let outputs: Vec<Vec<f64>> = vectors.iter().map(|v| head.affine(v)).collect();
+        let moment = |a: usize, b: usize| outputs.iter().map(|o| o[a] * o[b]).sum::<f64>() / 1999.0;
+        let centre = outputs.iter().map(|o| o[0]).sum::<f64>() / 2000.0;
+        assert!(centre.abs() < 1e-3, "{centre}");
+        assert!(moment(0, 5).abs() < 1e-3, "{}", moment(0, 5));
+        // Variance after half whitening is the deviation before: near 1 for the strongest, near 1/6 for the sixth.
+        assert!((moment(0, 0) - 1.0).abs() < 0.1, "{}", moment(0, 0));
+        assert!((moment(5, 5) * 6.0 - 1.0).abs() < 0.1, "{}", moment(5, 5));
+    }
+
+    #[test]
+    fn too_few_images_are_refused() {
+        let mut covariance = Covariance::new(DIM);
+        sample(256).iter().for_each(|v| covariance.add(v));
+        let error = covariance.half_whitened_head("x", BTreeMap::new()).unwrap_err();
+        assert!(error.to_string().contains("more than 256"), "{error}");
+    }
+}
