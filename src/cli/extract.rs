@@ -1,11 +1,8 @@
 //! Show every intermediate of extraction.
 
-use crate::extract::pull::resolve_model;
-use crate::extract::{
-    ExtractConfig, ExtractionTrace, Extractor, HeadChoice, Precision, Preset, TraceArray, TraceValues,
-};
+use super::model_args::ModelOptions;
+use crate::extract::{ExtractionTrace, Extractor, TraceArray, TraceValues};
 use crate::image::{ImageConfig, load_tensor};
-use crate::types::{ImageSize, PoolingStride};
 use anyhow::Context;
 use clap::Args;
 use safetensors::tensor::{Dtype, TensorView};
@@ -27,90 +24,9 @@ pub struct ExtractArgs {
     model: ModelOptions,
 }
 
-/// Which model to use and how: shared by every subcommand that describes images itself.
-#[derive(Debug, Clone, Default, Args)]
-#[command(next_help_heading = "Model")]
-pub struct ModelOptions {
-    /// The backbone.
-    #[arg(long, default_value_t)]
-    pub preset: Preset,
-    /// A weights file instead of the pulled one.
-    #[arg(long, value_name = "FILE")]
-    pub weights: Option<PathBuf>,
-    /// Fail rather than fetch a model that is not there.
-    #[arg(long)]
-    pub offline: bool,
-    /// Size images are squashed to, WIDTHxHEIGHT.
-    #[arg(long, value_name = "SIZE")]
-    pub input_size: Option<ImageSize>,
-    /// 0-based block whose tokens are used.
-    #[arg(long, value_name = "BLOCK")]
-    pub exit_block: Option<usize>,
-    /// Whether tokens pass the final LayerNorm.
-    #[arg(long, value_name = "BOOL")]
-    pub token_norm: Option<bool>,
-    /// 0-based block whose CLS attention ranks patches; the exit block unless set.
-    #[arg(long, value_name = "BLOCK")]
-    pub attention_block: Option<usize>,
-    /// Attention heads, where weights were trained with another count than the preset's.
-    #[arg(long)]
-    pub heads: Option<usize>,
-    /// Least attention of a key patch, in multiples of the uniform level [default: 1].
-    #[arg(long)]
-    pub tau: Option<f32>,
-    /// Most key patches at scales 1, 2, 3 [default: 400,200,50].
-    #[arg(long, value_delimiter = ',', num_args = 3, value_name = "N")]
-    pub caps: Option<Vec<usize>>,
-    /// Move fused windows by one patch instead of their own width.
-    #[arg(long)]
-    pub dense: bool,
-    /// Projection to the global descriptor: `default`, `none` or a file.
-    #[arg(long)]
-    pub head: Option<HeadChoice>,
-    /// Arithmetic of the linear layers.
-    #[arg(long, default_value_t)]
-    pub precision: Precision,
-}
-
-impl ModelOptions {
-    /// The settings these options stand for.
-    pub fn config(&self) -> ExtractConfig {
-        let default = ExtractConfig::default();
-        ExtractConfig {
-            preset: self.preset,
-            input_size: self.input_size,
-            exit_block: self.exit_block,
-            token_norm: self.token_norm,
-            attention_block: self.attention_block,
-            heads: self.heads,
-            tau: self.tau.unwrap_or(default.tau),
-            // clap has counted them.
-            caps: self.caps.as_deref().and_then(|caps| caps.try_into().ok()).unwrap_or(default.caps),
-            stride: if self.dense { PoolingStride::One } else { PoolingStride::Kernel },
-            head: self.head.clone().unwrap_or_default(),
-            precision: self.precision,
-        }
-    }
-
-    /// The weights file, pulled on first use.
-    pub fn weights(&self) -> anyhow::Result<PathBuf> {
-        match &self.weights {
-            Some(path) => Ok(path.clone()),
-            None => Ok(resolve_model(self.preset, self.offline)?),
-        }
-    }
-
-    /// The model, ready to use.
-    pub fn load(&self) -> anyhow::Result<Extractor> {
-        let config = self.config();
-        config.encoder_spec()?;
-        Ok(Extractor::load(&config, &self.weights()?, None)?)
-    }
-}
-
 /// Runs it.
 pub fn run(args: ExtractArgs) -> anyhow::Result<()> {
-    let extractor = args.model.load()?;
+    let extractor = args.model.open(&args.model.extract_config()?)?;
     let bytes = std::fs::read(&args.image).with_context(|| args.image.display().to_string())?;
     let image = load_tensor(&bytes, &ImageConfig::default(), extractor.input_size())
         .with_context(|| args.image.display().to_string())?;

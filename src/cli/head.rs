@@ -1,7 +1,7 @@
 //! Fit or train the projection to the global descriptor.
 
-use super::extract::ModelOptions;
-use crate::extract::{Covariance, Extractor, HeadChoice, hash_file};
+use super::model_args::ModelOptions;
+use crate::extract::{Covariance, ExtractConfig, Extractor, HeadChoice, hash_file};
 use crate::image::{ImageConfig, load_tensor};
 use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
@@ -60,8 +60,8 @@ pub fn run(args: HeadArgs) -> anyhow::Result<()> {
 fn fit(args: FitArgs) -> anyhow::Result<()> {
     let Aggregate::Mean = args.aggregate;
     let files = list_images(&args.images)?;
-    let options = ModelOptions { head: Some(HeadChoice::None), ..args.model };
-    let extractor = options.load()?;
+    let config = ExtractConfig { head: HeadChoice::None, ..args.model.extract_config()? };
+    let extractor = args.model.open(&config)?;
     let mut covariance = Covariance::new(extractor.dim());
     let mut unreadable = Vec::new();
     let bar = ProgressBar::new(files.len() as u64)

@@ -24,6 +24,15 @@ pub struct ModelOptions {
     /// 0-based block whose tokens and attention are used.
     #[arg(long, value_name = "BLOCK")]
     pub exit_block: Option<usize>,
+    /// Whether tokens pass the final LayerNorm: true or false.
+    #[arg(long, value_name = "BOOL")]
+    pub token_norm: Option<bool>,
+    /// 0-based block whose CLS attention ranks patches; the exit block unless set.
+    #[arg(long, value_name = "BLOCK")]
+    pub attention_block: Option<usize>,
+    /// Attention heads, where weights were trained with another count than the preset's.
+    #[arg(long, value_name = "N")]
+    pub heads: Option<usize>,
     /// Key patches must exceed this multiple of the uniform attention.
     #[arg(long)]
     pub tau: Option<f32>,
@@ -58,6 +67,9 @@ impl ModelOptions {
             head: self.head.clone(),
             input_size: self.input_size,
             exit_block: self.exit_block,
+            token_norm: self.token_norm,
+            attention_block: self.attention_block,
+            heads: self.heads,
             ..Default::default()
         };
         if let Some(caps) = &self.caps {
