@@ -1,7 +1,7 @@
 //! Results for people: text, and a self-contained HTML page.
 
 mod ablation;
-mod html;
+pub(crate) mod html;
 mod plots;
 mod svg;
 mod text;

@@ -1,0 +1,195 @@
+//! What the demo showed: a table on the terminal, a page with pictures.
+
+use crate::draw::{jpeg_data_uri, thumbnail};
+use crate::eval::report::html::{escape, page, table};
+use crate::image::{ImageConfig, decode};
+use anyhow::Context;
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// One place in an answer.
+pub(super) struct Found {
+    pub(super) reference: String,
+    distance: f64,
+    score: u64,
+    right: bool,
+}
+
+/// One query and its answer.
+pub(super) struct Asked {
+    pub(super) query: String,
+    /// Whether the town's map shows the place at all.
+    mapped: bool,
+    /// In the server's order.
+    pub(super) results: Vec<Found>,
+    /// Milliseconds per stage.
+    stages: BTreeMap<String, f64>,
+}
+
+/// A picture of a query beside its best answer.
+pub(super) struct Evidence {
+    /// Which query.
+    pub(super) asked: usize,
+    /// The file.
+    pub(super) picture: PathBuf,
+}
+
+impl Asked {
+    /// Reads an answer of `POST /query`; `None` if it lacks what every answer has.
+    pub(super) fn read(query: &str, right: &BTreeSet<String>, answer: &Value) -> Option<Self> {
+        let found = |result: &Value| {
+            let reference = result["external_id"].as_str()?.to_owned();
+            let right = right.contains(&reference);
+            let (distance, score) = (result["global_distance"].as_f64()?, result["spatial_score"].as_u64()?);
+            Some(Found { reference, distance, score, right })
+        };
+        let results = answer["results"].as_array()?.iter().map(found).collect::<Option<_>>()?;
+        let stages = answer["timings_ms"].as_object()?.iter();
+        let stages = stages.map(|(stage, ms)| Some((stage.clone(), ms.as_f64()?))).collect::<Option<_>>()?;
+        Some(Self { query: query.into(), mapped: !right.is_empty(), results, stages })
+    }
+
+    /// The answer without re-ranking.
+    fn global_best(&self) -> Option<&Found> {
+        self.results.iter().min_by(|a, b| a.distance.total_cmp(&b.distance))
+    }
+
+    fn right(&self) -> bool {
+        self.results.first().is_some_and(|best| best.right)
+    }
+
+    fn globally_right(&self) -> bool {
+        self.global_best().is_some_and(|best| best.right)
+    }
+
+    /// Whether re-ranking turned a wrong answer into the right one.
+    pub(super) fn reranking_helped(&self) -> bool {
+        self.right() && !self.globally_right()
+    }
+
+    /// S of the best answer.
+    pub(super) fn best_score(&self) -> u64 {
+        self.results.first().map_or(0, |best| best.score)
+    }
+
+    fn verdict(&self) -> &'static str {
+        match (self.mapped, self.right(), self.globally_right()) {
+            (false, ..) => "not in the map",
+            (true, true, true) => "right",
+            (true, true, false) => "right after re-ranking",
+            (true, false, _) => "wrong",
+        }
+    }
+}
+
+/// A line per query.
+pub(super) fn print_table(asked: &[Asked]) {
+    println!("   {:<34} {:<34} {:>5} {:>9} {:>8} {:>8}  verdict", "query", "best reference", "S", "extract", "search", "re-rank");
+    for one in asked {
+        let best = one.results.first().map_or("-", |best| best.reference.as_str());
+        let stage = |name: &str| one.stages.get(name).copied().unwrap_or_default();
+        println!(
+            "   {:<34} {best:<34} {:>5} {:>6.0} ms {:>5.2} ms {:>5.0} ms  {}",
+            one.query,
+            one.best_score(),
+            stage("extract"),
+            stage("search"),
+            stage("load") + stage("rerank"),
+            one.verdict()
+        );
+    }
+}
+
+/// The demo in three sentences.
+pub(super) fn summary(asked: &[Asked]) -> String {
+    let mapped: Vec<&Asked> = asked.iter().filter(|one| one.mapped).collect();
+    let unmapped = asked.iter().filter(|one| !one.mapped);
+    let globally = mapped.iter().filter(|one| one.globally_right()).count();
+    let reranked = mapped.iter().filter(|one| one.right()).count();
+    let lowest_right = mapped.iter().filter(|one| one.right()).map(|one| one.best_score()).min();
+    let highest_unmapped = unmapped.map(Asked::best_score).max();
+    let mut text = format!(
+        "Right at rank 1: {globally} of {} by the global descriptor alone, {reranked} after re-ranking.",
+        mapped.len()
+    );
+    if let (Some(lowest), Some(highest)) = (lowest_right, highest_unmapped) {
+        text += &format!(
+            "\nPlaces that are not in the map score at most S = {highest}; right answers score at least {lowest}."
+        );
+    }
+    text
+}
+
+/// Writes the page.
+pub(super) fn write(
+    path: &Path,
+    town: &Path,
+    asked: &[Asked],
+    evidence: &[Evidence],
+    info: &Value,
+    import_seconds: f64,
+) -> anyhow::Result<()> {
+    let mut body = format!(
+        "<p class=\"lead\">{}</p>\n<p>Model <code>{}</code>; importing took {import_seconds:.1} s.</p>\n",
+        escape(&summary(asked)),
+        escape(info["model"]["id"].as_str().or(info["model"].as_str()).unwrap_or("unknown"))
+    );
+    body += &all_queries(asked);
+    body += "<h2>The evidence</h2>\n<p>Above: attention, with the key patches of three scales as squares. Below, for \
+             each combination of scales: the correspondences that one homography explains.</p>\n";
+    for one in evidence {
+        body += &figure(town, &asked[one.asked], &one.picture)?;
+    }
+    std::fs::write(path, page("PlaceFormer demo", &body)).with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn all_queries(asked: &[Asked]) -> String {
+    let rows: Vec<Vec<String>> = asked
+        .iter()
+        .map(|one| {
+            let name = |found: Option<&Found>| found.map_or("-".into(), |found| escape(&found.reference));
+            let total: f64 = one.stages.values().sum();
+            vec![
+                escape(&one.query),
+                name(one.global_best()),
+                name(one.results.first()),
+                one.best_score().to_string(),
+                format!("{total:.0}"),
+                one.verdict().into(),
+            ]
+        })
+        .collect();
+    let headers = ["Query", "Best by global descriptor", "Best after re-ranking", "S", "ms", "Verdict"];
+    table("Every query of the demo", &headers, &rows)
+}
+
+/// Query, best reference before and after re-ranking, and the picture of the match.
+fn figure(town: &Path, asked: &Asked, picture: &Path) -> anyhow::Result<String> {
+    let photo = |folder: &str, name: &str, caption: &str, class: &str| -> anyhow::Result<String> {
+        let uri = embed(&town.join(folder).join(name), 420)?;
+        Ok(format!(
+            "<figure class=\"{class}\"><img src=\"{uri}\" alt=\"{}\"><figcaption>{caption}</figcaption></figure>",
+            escape(name)
+        ))
+    };
+    let class = |right: bool| if right { "right" } else { "wrong" };
+    let mut html = format!("<h3>{} &mdash; {}</h3>\n<div class=\"row\">", escape(&asked.query), asked.verdict());
+    html += &photo("queries", &asked.query, "query", "")?;
+    if let (Some(before), Some(after)) = (asked.global_best(), asked.results.first()) {
+        html += &photo("database", &before.reference, "best by the global descriptor", class(before.right))?;
+        html += &photo("database", &after.reference, "best after re-ranking", class(after.right))?;
+    }
+    html += &format!(
+        "</div>\n<img src=\"{}\" alt=\"Key patches and inlier lines of {} and its best reference\">\n",
+        embed(picture, 1400)?,
+        escape(&asked.query)
+    );
+    Ok(html)
+}
+
+fn embed(path: &Path, longest_side: u32) -> anyhow::Result<String> {
+    let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let image = decode(&bytes, &ImageConfig::default()).with_context(|| path.display().to_string())?;
+    Ok(jpeg_data_uri(&thumbnail(&image, longest_side)?, 85)?)
+}
