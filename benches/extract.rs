@@ -24,7 +24,7 @@ fn weights(preset: Preset) -> VitWeights {
     let Geometry { dim, mlp_dim, .. } = geometry;
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let norm = || Norm { weight: vec![1.0; dim], bias: vec![0.0; dim] };
-    let mut block = |random: &mut ChaCha8Rng| BlockWeights {
+    let block = |random: &mut ChaCha8Rng| BlockWeights {
         norm1: norm(),
         qkv: linear(random, 3 * dim, dim),
         proj: linear(random, dim, dim),

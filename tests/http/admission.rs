@@ -73,7 +73,9 @@ async fn a_full_queue_refuses_at_once_and_recovers() {
     }
     let refused: Vec<&Answer> = answers.iter().filter(|answer| answer.status != 200).collect();
     assert_eq!(refused.len(), 4);
-    refused.iter().for_each(|answer| drop(answer.problem("overloaded")));
+    refused.iter().for_each(|answer| {
+        answer.problem("overloaded");
+    });
     app.source.slow_down(Duration::ZERO);
     app.post_png("/query?map=m", 1).await.ok();
 }

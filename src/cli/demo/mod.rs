@@ -63,7 +63,14 @@ pub fn run(args: DemoArgs) -> anyhow::Result<()> {
     let started = Instant::now();
     let (database, positions) = (town.join("database"), town.join("positions.csv"));
     placeformer(&[
-        "import", text(&database)?, "--map", MAP, "--server", server.url(), "--positions", text(&positions)?,
+        "import",
+        text(&database)?,
+        "--map",
+        MAP,
+        "--server",
+        server.url(),
+        "--positions",
+        text(&positions)?,
     ])?;
     let import_seconds = started.elapsed().as_secs_f64();
 

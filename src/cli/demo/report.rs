@@ -85,7 +85,10 @@ impl Asked {
 
 /// A line per query.
 pub(super) fn print_table(asked: &[Asked]) {
-    println!("   {:<34} {:<34} {:>5} {:>9} {:>8} {:>8}  verdict", "query", "best reference", "S", "extract", "search", "re-rank");
+    println!(
+        "   {:<34} {:<34} {:>5} {:>9} {:>8} {:>8}  verdict",
+        "query", "best reference", "S", "extract", "search", "re-rank"
+    );
     for one in asked {
         let best = one.results.first().map_or("-", |best| best.reference.as_str());
         let stage = |name: &str| one.stages.get(name).copied().unwrap_or_default();
