@@ -4,12 +4,13 @@ use super::model_args::ModelOptions;
 use crate::eval::ablate::{Base, ablate};
 use crate::eval::datasets::{self, Dataset, DatasetKind, DatasetOptions, Split};
 use crate::eval::features::{Describe, FeatureCache, Features, GlobalKind, ModelDescriber};
+use crate::eval::report::{Painter, gallery};
 use crate::eval::run::{Answer, QuerySeconds, rerank_all, search_all};
 use crate::eval::summary::{RunConfig, Summary, summarise};
 use crate::eval::{EvalError, prediction, report};
-use crate::extract::{ExtractConfig, Preset};
+use crate::extract::{ExtractConfig, Extractor, Preset};
 use crate::image::ImageConfig;
-use crate::rerank::RerankConfig;
+use crate::rerank::{RerankConfig, Reranker};
 use crate::types::ScaleSet;
 use anyhow::{Context, bail, ensure};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
@@ -107,6 +108,9 @@ struct OutputArgs {
     /// Write a self-contained report.
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
+    /// Queries of each kind (worst, best, without match) shown as pictures in the report.
+    #[arg(long, default_value_t = 4, value_name = "N")]
+    pictures: usize,
     /// Write the benchmark's prediction file (MSLS, RobotCar Seasons).
     #[arg(long, value_name = "FILE")]
     predictions: Option<PathBuf>,
@@ -142,6 +146,10 @@ pub fn run(args: EvalArgs) -> anyhow::Result<()> {
         write(path, &(serde_json::to_string_pretty(&json)? + "\n"))?;
     }
     if let Some(path) = &args.output.html {
+        let limits = ImageConfig::default();
+        let reranker = Reranker::new(args.method.rerank_config());
+        let painter = Painter { extractor: &measured.extractor, limits: &limits, reranker: &reranker };
+        details += &gallery(&painter, &dataset, &measured.answers, args.output.pictures)?;
         write(path, &report::html(&measured.summary, &dataset, &measured.answers, &details))?;
     }
     Ok(())
@@ -187,6 +195,7 @@ impl MethodArgs {
 }
 
 struct Measured {
+    extractor: Extractor,
     answers: Vec<Answer>,
     summary: Summary,
 }
@@ -216,7 +225,7 @@ fn measure(args: &EvalArgs, dataset: &Dataset, extract: &ExtractConfig) -> anyho
         seed: args.method.seed,
     };
     let summary = summarise(dataset, &database, &queries, &answers, seconds, config)?;
-    Ok(Measured { answers, summary })
+    Ok(Measured { extractor: describer.extractor, answers, summary })
 }
 
 fn answer_all(

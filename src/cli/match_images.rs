@@ -1,10 +1,120 @@
 //! Match two images and draw the evidence.
 
+use super::model_args::ModelOptions;
+use crate::eval::evidence::{Seen, picture};
+use crate::image::{ImageConfig, encode_jpeg, encode_png};
+use crate::rerank::{CombinationMatch, RerankConfig, Reranker};
+use crate::types::ScaleSet;
+use anyhow::{Context, bail};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
-pub struct MatchArgs {}
+pub struct MatchArgs {
+    /// Query image.
+    query: PathBuf,
+    /// Reference image.
+    reference: PathBuf,
+    /// Draw both images, their attention and key patches, and the inliers, as PNG or JPEG.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Print the correspondences and homographies as JSON.
+    #[arg(long)]
+    json: bool,
+    /// Scale combinations whose inliers add up to S.
+    #[arg(long, value_delimiter = ',', default_value = "1,1+2,2+3", value_name = "SET,...")]
+    scales: Vec<ScaleSet>,
+    #[command(flatten)]
+    model: ModelOptions,
+}
 
 /// Runs it.
-pub fn run(_args: MatchArgs) -> anyhow::Result<()> {
-    anyhow::bail!("not built yet")
+pub fn run(args: MatchArgs) -> anyhow::Result<()> {
+    crate::kernels::self_check()?;
+    let encode = args.out.as_deref().map(encoder).transpose()?;
+    let extractor = args.model.open(&args.model.extract_config()?)?;
+    let limits = ImageConfig::default();
+    let see = |path: &Path| {
+        let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+        Seen::new(&extractor, &limits, &bytes).with_context(|| format!("cannot use {}", path.display()))
+    };
+    let (query, reference) = (see(&args.query)?, see(&args.reference)?);
+    let reranker = Reranker::new(RerankConfig { scales: args.scales, ..Default::default() });
+    let matches = reranker.explain(&query.patches, &reference.patches);
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&as_json(&query, &reference, &matches))?);
+    } else {
+        print_counts(&query, &reference, &matches);
+    }
+    if let (Some(path), Some(encode)) = (&args.out, encode) {
+        let bytes = encode(&picture(&query, &reference, &matches)?)?;
+        std::fs::write(path, bytes).with_context(|| format!("cannot write {}", path.display()))?;
+        eprintln!("wrote {}", path.display());
+    }
+    Ok(())
+}
+
+type Encode = fn(&crate::image::RgbImage) -> anyhow::Result<Vec<u8>>;
+
+/// Chosen before the model is loaded, so that a wrong name costs nothing.
+fn encoder(path: &Path) -> anyhow::Result<Encode> {
+    let extension = path.extension().and_then(|extension| extension.to_str()).unwrap_or_default();
+    match extension.to_ascii_lowercase().as_str() {
+        "png" => Ok(|image| Ok(encode_png(image)?)),
+        "jpg" | "jpeg" => Ok(|image| Ok(encode_jpeg(image, 90)?)),
+        _ => bail!("{}: the picture must end in .png, .jpg or .jpeg", path.display()),
+    }
+}
+
+fn spatial_score(matches: &[CombinationMatch]) -> u32 {
+    matches.iter().map(|found| found.score.inliers).sum()
+}
+
+fn global_distance(query: &Seen, reference: &Seen) -> f32 {
+    query.global.iter().zip(&reference.global).map(|(a, b)| (a - b) * (a - b)).sum::<f32>().sqrt()
+}
+
+fn print_counts(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) {
+    let counts = |seen: &Seen| seen.patches.counts.map(|count| count.to_string()).join(" / ");
+    println!("key patches   {} and {}", counts(query), counts(reference));
+    println!("distance      {:.4}", global_distance(query, reference));
+    for found in matches {
+        let score = found.score;
+        println!("{:<13} {} inliers of {} matches", score.scales.score_name(), score.inliers, score.matches);
+    }
+    println!("S             {}", spatial_score(matches));
+}
+
+fn as_json(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) -> Value {
+    let side = |seen: &Seen| {
+        let grid = seen.patches.grid;
+        let input = [u32::from(grid.columns), u32::from(grid.rows)].map(|n| n * u32::from(grid.patch_px));
+        json!({ "key_patches": seen.patches.counts, "input_size": input })
+    };
+    let combination = |found: &CombinationMatch| {
+        let pair = |pair: &crate::rerank::Correspondence| {
+            let (from, to) = (pair.query as usize, pair.reference as usize);
+            json!({
+                "query": query.patches.centre(from),
+                "reference": reference.patches.centre(to),
+                "scales": [query.patches.scale_of(from), reference.patches.scale_of(to)],
+                "inlier": pair.inlier,
+            })
+        };
+        json!({
+            "score": found.score.scales.score_name(),
+            "matches": found.score.matches,
+            "inliers": found.score.inliers,
+            "homography": found.homography,
+            "correspondences": found.correspondences.iter().map(pair).collect::<Vec<_>>(),
+        })
+    };
+    json!({
+        "spatial_score": spatial_score(matches),
+        "global_distance": global_distance(query, reference),
+        "query": side(query),
+        "reference": side(reference),
+        "combinations": matches.iter().map(combination).collect::<Vec<_>>(),
+    })
 }

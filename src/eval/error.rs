@@ -1,7 +1,9 @@
 //! What can go wrong while measuring, each with the file and the cause.
 
+use crate::draw::DrawError;
 use crate::error::ErrorCode;
 use crate::extract::ExtractError;
+use crate::image::ImageError;
 use std::path::{Path, PathBuf};
 
 /// Why an evaluation could not run.
@@ -62,6 +64,12 @@ pub enum EvalError {
     /// A setting is out of range or does not go with another.
     #[error("{0}")]
     Setting(String),
+    /// An image cannot be used.
+    #[error(transparent)]
+    Image(#[from] ImageError),
+    /// A picture cannot be drawn.
+    #[error(transparent)]
+    Draw(#[from] DrawError),
     /// The model failed.
     #[error(transparent)]
     Extract(#[from] ExtractError),
@@ -77,6 +85,8 @@ impl EvalError {
             | Self::UnknownImages { .. }
             | Self::Empty { .. }
             | Self::Setting(_) => ErrorCode::InvalidParameter,
+            Self::Image(error) => error.code(),
+            Self::Draw(error) => error.code(),
             Self::Extract(error) => error.code(),
         }
     }

@@ -8,6 +8,7 @@
 pub mod ablate;
 pub mod datasets;
 mod error;
+pub mod evidence;
 pub mod features;
 pub mod measure;
 pub mod prediction;

@@ -1,7 +1,7 @@
 //! What the demo showed: a table on the terminal, a page with pictures.
 
 use crate::draw::{jpeg_data_uri, thumbnail};
-use crate::eval::report::html::{escape, page, table};
+use crate::eval::report::{escape, page, table};
 use crate::image::{ImageConfig, decode};
 use anyhow::Context;
 use serde_json::Value;

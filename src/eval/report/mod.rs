@@ -1,12 +1,14 @@
 //! Results for people: text, and a self-contained HTML page.
 
 mod ablation;
-pub(crate) mod html;
+mod gallery;
+mod html;
 mod plots;
 mod svg;
 mod text;
 
 pub use ablation::{ablation_html, ablation_text};
+pub use gallery::{Painter, gallery};
 pub use html::{escape, page, table};
 pub use plots::plots;
 pub use svg::{Histogram, LineChart, Series};
