@@ -1,0 +1,107 @@
+# `make` or `make help` lists the targets.
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+export PATH := $(CURDIR)/.venv/bin:$(PATH)
+
+# What `make test` and CI run, cheapest first.
+TEST_STEPS := fmt promtool deny clippy unit doc model schemathesis compose
+PYTHON ?= python3
+FUZZ_SECONDS ?= 60
+MODEL ?= dinov2-vits14
+# The development profile is optimised, so one build serves every step of `make test`.
+DEBUG_BIN := target/debug/placeformer
+RELEASE_BIN := target/release/placeformer
+IMAGE ?= placeformer:local
+
+.PHONY: help
+help: ## Show this list
+	@awk -F ':.*## ' '/^## /{printf "\n%s\n", substr($$0, 4)} /^[a-z_-]+:.*## /{printf "  \033[36m%-14s\033[0m %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+## Use
+
+.PHONY: demo
+demo: ## Serve a demo map, query it, leave a report in demo-report/
+	cargo build --release --locked
+	$(RELEASE_BIN) demo --out demo-report
+
+.PHONY: head
+head: ## Make the default projection head again (models/)
+	cargo build --release --locked
+	PLACEFORMER=$(RELEASE_BIN) models/make_head.sh
+
+.PHONY: bench
+bench: ## Measure every stage beside its baselines
+	cargo build --release --locked
+	$(RELEASE_BIN) bench
+
+.PHONY: container
+container: ## Build the container image (IMAGE=placeformer:local)
+	docker/build.sh $(IMAGE)
+
+## Test
+
+.PHONY: test
+test: ## Everything CI runs, with durations
+	@MAKE=$(MAKE) tests/all.sh $(TEST_STEPS)
+
+.PHONY: check
+check: fmt clippy ## The quick round while you work
+	cargo test --locked --lib --test architecture
+
+.PHONY: fmt
+fmt: ## Formatting
+	cargo fmt --check
+
+.PHONY: clippy
+clippy: ## Lints; warnings are errors
+	cargo clippy --locked --all-targets -- -D warnings
+
+.PHONY: deny
+deny: .venv/tools ## Licences, bans and sources of dependencies
+	cargo fetch --locked
+	cargo deny --offline --all-features check bans licenses sources
+
+.PHONY: advisories
+advisories: .venv/tools ## Known vulnerabilities (needs the network)
+	cargo deny --all-features check advisories
+
+.PHONY: unit
+unit: .venv/tools model ## Unit, property and behaviour tests
+	cargo nextest run --locked --no-fail-fast
+
+.PHONY: doc
+doc: ## Examples in the documentation, and its links
+	cargo test --locked --doc
+	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --quiet
+
+.PHONY: model
+model: ## Obtain the model's weights
+	cargo build --locked
+	$(DEBUG_BIN) model pull $(MODEL)
+
+.PHONY: promtool
+promtool: ## Prometheus configuration and alert rules
+	tests/promtool.sh
+
+.PHONY: schemathesis
+schemathesis: model ## Generated requests against a live server
+	PLACEFORMER=$(DEBUG_BIN) tests/schemathesis.sh
+
+.PHONY: compose
+compose: model ## The composed system end to end (skips without Docker)
+	$(PYTHON) tests/compose/run.py --binary $(DEBUG_BIN)
+
+.PHONY: fuzz
+fuzz: .venv/tools ## Each fuzz target for FUZZ_SECONDS (60)
+	fuzz/run.sh $(FUZZ_SECONDS)
+
+.PHONY: clean
+clean: ## Remove everything made here
+	rm -rf target .venv .tools demo-report fuzz/target fuzz/corpus
+
+# Pinned tools in a virtual environment of the project's own.
+.venv/tools: tests/tools.txt
+	[ -x .venv/bin/pip ] || $(PYTHON) -m venv .venv
+	.venv/bin/pip install --quiet --disable-pip-version-check --require-hashes -r tests/tools.txt
+	touch $@

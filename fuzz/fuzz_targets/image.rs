@@ -1,0 +1,22 @@
+//! Image bytes: whatever arrives is an image within the limits or a typed error; never a panic, never more pixels
+//! than allowed.
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+use placeformer::image::{ImageConfig, decode, load_tensor, read_exif};
+use placeformer::types::ImageSize;
+
+fuzz_target!(|bytes: &[u8]| {
+    // Small limits: the same checks are met with less memory a round.
+    let config = ImageConfig { max_bytes: 1 << 20, max_side: 2048, max_pixels: 1 << 20 };
+    let _ = read_exif(bytes);
+    if let Ok(image) = decode(bytes, &config) {
+        let (width, height) = (image.size.width as u64, image.size.height as u64);
+        assert!(width > 0 && height > 0);
+        assert!(width <= 2048 && height <= 2048 && width * height <= 1 << 20, "{width} x {height} is beyond the limits");
+        assert_eq!(image.pixels.len() as u64, 3 * width * height);
+        let size = ImageSize { width: 28, height: 14 };
+        let tensor = load_tensor(bytes, &config, size).expect("what decodes can be resized");
+        assert!(tensor.data.iter().all(|value| value.is_finite()));
+    }
+});

@@ -1,0 +1,22 @@
+#!/usr/bin/env bash
+# Runs fuzz targets with AddressSanitizer: `fuzz/run.sh SECONDS [TARGET...]`, all targets without names.
+# A finding stops the run; its input is left in fuzz/artifacts/ (`cargo fuzz run TARGET FILE` repeats it).
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")"
+seconds=$1
+shift
+[[ -x ../.venv/bin/cargo-fuzz ]] && PATH="$(cd ../.venv/bin && pwd):$PATH"
+# Sanitizers are unstable options of the one, stable, toolchain the project uses.
+export RUSTC_BOOTSTRAP=1
+if [[ $# == 0 ]]; then
+    mapfile -t targets < <(cargo fuzz list --fuzz-dir .)
+else
+    targets=("$@")
+fi
+python3 seed_corpus.py
+for target in "${targets[@]}"; do
+    printf '\n==== %s for %s s\n' "$target" "$seconds"
+    cargo fuzz run --fuzz-dir . "$target" "corpus/$target" -- \
+        -max_total_time="$seconds" -rss_limit_mb=2048 -timeout=20 -max_len=65536 -print_final_stats=1 -verbosity=1
+done
+printf '\n%d passed, 0 failed\n' "${#targets[@]}"

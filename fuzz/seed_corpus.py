@@ -1,0 +1,155 @@
+#!/usr/bin/env python3
+"""Writes the seed corpus of every fuzz target to fuzz/corpus/: small valid inputs and their near misses.
+
+Only the standard library is used. Golden images, where they are checked out, are added to the image seeds.
+"""
+
+import base64
+import pathlib
+import struct
+import zlib
+
+ROOT = pathlib.Path(__file__).resolve().parent
+JPEG = base64.b64decode(
+    "/9j/4AAQSkZJRgABAQEASABIAAD/2wBDAP//////////////////////////////////////////////////////////////////////////"
+    "////////////wgALCAABAAEBAREA/8QAFBABAAAAAAAAAAAAAAAAAAAAAP/aAAgBAQABPxA="
+)
+WEBP_LOSSY = base64.b64decode("UklGRiIAAABXRUJQVlA4IBYAAAAwAQCdASoBAAEADsD+JaQAA3AAAAAA")
+WEBP_LOSSLESS = base64.b64decode("UklGRhoAAABXRUJQVlA4TA0AAAAvAAAAEAcQERGIiP4HAA==")
+
+
+def png(width, height, colour, depth, row_bytes, extra=b""):
+    """A PNG with rows of a simple pattern; `colour` and `depth` as in its header."""
+    rows = b"".join(b"\0" + bytes((x * 7 + y) & 255 for x in range(row_bytes)) for y in range(height))
+
+    def chunk(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + extra + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+def palette():
+    body = bytes(range(48))
+    return struct.pack(">I", len(body)) + b"PLTE" + body + struct.pack(">I", zlib.crc32(b"PLTE" + body))
+
+
+def exif_jpeg(orientation):
+    tiff = b"II*\0\x08\0\0\0" + struct.pack("<HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
+    body = b"Exif\0\0" + tiff
+    return JPEG[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + JPEG[2:]
+
+
+def image_seeds():
+    seeds = {
+        "jpeg": JPEG,
+        "webp_lossy": WEBP_LOSSY,
+        "webp_lossless": WEBP_LOSSLESS,
+        "png_rgb": png(5, 3, 2, 8, 15),
+        "png_rgb16": png(4, 4, 2, 16, 24),
+        "png_grey": png(6, 2, 0, 8, 6),
+        "png_grey_alpha": png(3, 3, 4, 8, 6),
+        "png_rgba": png(2, 5, 6, 8, 8),
+        "png_palette": png(4, 4, 3, 4, 2, palette()),
+        "png_one_row": png(64, 1, 0, 1, 8),
+        "png_truncated": png(5, 3, 2, 8, 15)[:-20],
+        "png_huge_header": png(50000, 50000, 2, 8, 0)[:60],
+        "text": b"this is not an image",
+    }
+    seeds.update({f"jpeg_exif_{n}": exif_jpeg(n) for n in (1, 3, 6, 8)})
+    for folder in (ROOT.parent / "tests" / "golden",):
+        for picture in sorted(folder.glob("*.png"))[:1]:
+            if picture.stat().st_size < 200_000:
+                seeds[picture.stem] = picture.read_bytes()
+    return seeds
+
+
+def patch_blob(stride, columns, rows, counts, length=8):
+    """A blob of the layout that src/store/codec.rs describes."""
+    n = sum(counts)
+    blob = b"PFKP" + struct.pack("<HBBHHHHIII", 1, stride, 0, columns, rows, 14, length, *counts)
+    blob += b"".join(struct.pack("<H", index) for count in counts for index in range(count))
+    blob += struct.pack("<e", 1.5) * n + struct.pack("<f", 0.01) * n + bytes(i & 63 for i in range(length)) * n
+    return blob + struct.pack("<I", zlib.crc32(blob))
+
+
+def patch_seeds():
+    whole = patch_blob(0, 8, 6, (4, 2, 1))
+    return {
+        "whole": whole,
+        "empty": patch_blob(0, 32, 24, (0, 0, 0)),
+        "stride_one": patch_blob(1, 8, 6, (2, 2, 2)),
+        "default_length": patch_blob(0, 32, 24, (3, 1, 1), 384),
+        "truncated": whole[:-9],
+        "wrong_checksum": whole[:-1] + bytes([whole[-1] ^ 1]),
+        "promises_too_much": whole[:16] + b"\xff" * 12 + whole[28:],
+        "zeros": bytes(64),
+    }
+
+
+def multipart_seeds():
+    def form(*parts, end=b"--X--\r\n"):
+        return b"\0" + b"".join(b"--X\r\n" + head + b"\r\n\r\n" + body + b"\r\n" for head, body in parts) + end
+
+    image = (b'Content-Disposition: form-data; name="image"; filename="a.jpg"\r\nContent-Type: image/jpeg', JPEG)
+    options = (b'Content-Disposition: form-data; name="json"\r\nContent-Type: application/json', b'{"map":"a","top_k":3}')
+    embedded = b'{"map":"a","image":"' + base64.b64encode(JPEG) + b'"}'
+    return {
+        "form": form(image, options),
+        "form_without_image": form(options),
+        "form_twice": form(image, image),
+        "form_unended": form(image, end=b""),
+        "json": b"\1" + embedded,
+        "json_bad_base64": b'\1{"map":"a","image":"%%%"}',
+        "json_deep": b"\1" + b"[" * 200,
+        "raw": b"\2" + JPEG,
+        "odd_boundary": b"\3" + form(image)[1:],
+    }
+
+
+QUERY_SEEDS = [
+    "map=a",
+    "map=a&top_k=10&candidates=100&rerank=true&deadline_ms=500",
+    "map=a&near=52.2,0.12&radius_m=100",
+    "map=a&captured_after=2024-01-01T00:00:00Z&captured_before=2025-01-01T00:00:00%2B02:00",
+    "map=a&near=95,0&radius_m=NaN",
+    "map=%00&top_k=-1",
+    "map=a&map=b&unknown=1",
+    "map=" + "a" * 300,
+]
+
+CONFIG_SEEDS = [
+    '[http]\nlisten = "127.0.0.1:0"\nmax_connections = 10\n',
+    "[extract]\ncaps = [400, 200, 50]\ntau = 1.0\n",
+    '[extract]\npreset = "dinov2-vits14"\ninput_size = [448, 336]\nexit_block = 8\n',
+    "[rerank]\nscales = [[1], [1, 2], [2, 3]]\n",
+    '[auth]\n[[auth.keys]]\nname = "a"\nsha256 = "' + "0" * 64 + '"\nrole = "read"\n',
+    "[pipeline]\nqueue_capacity = 64\ntop_k = 10\ncandidates = 100\n",
+    '[log]\nformat = "json"\nfilter = "info"\n',
+    "unknown = 1\n",
+    "[http]\nmax_page = 99999999999999999999\n",
+]
+
+
+def numbered(texts):
+    return {f"{index:02}": text.encode() for index, text in enumerate(texts)}
+
+
+def main():
+    corpora = {
+        "image": image_seeds(),
+        "patch_blob": patch_seeds(),
+        "multipart": multipart_seeds(),
+        "query_options": numbered(QUERY_SEEDS),
+        "config": numbered(CONFIG_SEEDS),
+    }
+    for target, seeds in corpora.items():
+        folder = ROOT / "corpus" / target
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, body in seeds.items():
+            (folder / f"seed_{name}").write_bytes(body)
+        print(f"{target}: {len(seeds)} seeds")
+
+
+if __name__ == "__main__":
+    main()
