@@ -128,9 +128,18 @@ fn rebuilt_equals_live_across_many_blocks() {
         ids.push(created.id);
     }
     assert_equal(&rebuild(&store, &city), &live);
-    for id in ids.iter().filter(|id| id.seed() % 3 != 0).take(5000) {
-        store.delete(*id).unwrap();
-        assert!(live.remove(*id));
-    }
+    // Several threads, so that their deletions share syncs of the disk.
+    let doomed: Vec<ReferenceId> = ids.into_iter().filter(|id| id.seed() % 3 != 0).collect();
+    std::thread::scope(|scope| {
+        for part in doomed.chunks(doomed.len().div_ceil(32)) {
+            let (store, live) = (&store, &live);
+            scope.spawn(move || {
+                for id in part {
+                    store.delete(*id).unwrap();
+                    assert!(live.remove(*id));
+                }
+            });
+        }
+    });
     assert_equal(&rebuild(&store, &city), &live);
 }
