@@ -14,7 +14,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 /// Heads that ship, one per backbone.
-const BUILT_IN: [&[u8]; 0] = [];
+const BUILT_IN: [&[u8]; 1] = [include_bytes!("../../models/dinov2-vits14-b8.safetensors")];
 
 /// A projection d -> 256.
 #[derive(Debug, Clone, PartialEq)]
