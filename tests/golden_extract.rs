@@ -134,7 +134,8 @@ impl Comparison<'_> {
             }
             let mut all: Vec<_> = keys.index.iter().map(|&i| i as i64).collect();
             let mut all_expected = expected_index.clone();
-            (all.sort_unstable(), all_expected.sort_unstable());
+            all.sort_unstable();
+            all_expected.sort_unstable();
             assert_eq!(all, all_expected, "{}: {base}: not the same set of patches", self.label);
             self.report(&format!("{base}_index"), "swaps", swaps as f32, swaps <= keys.index.len() / 20);
             let worst = largest_difference(&keys.attention, expected_attention);

@@ -14,5 +14,6 @@ pub(super) fn ramp(len: usize, seed: u32) -> Vec<f32> {
 
 /// Whether `actual` is farther than `tolerance` from `expected`, or not a number.
 pub(super) fn differ(actual: f32, expected: f64, tolerance: f64) -> bool {
-    !((f64::from(actual) - expected).abs() <= tolerance)
+    let difference = (f64::from(actual) - expected).abs();
+    difference.is_nan() || difference > tolerance
 }

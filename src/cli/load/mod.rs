@@ -94,7 +94,7 @@ async fn drive(args: &LoadArgs) -> anyhow::Result<Report> {
 /// Sends requests when they are due and collects what became of each.
 async fn open_loop(target: &Arc<Target>, rate: f64, duration: Duration, max_in_flight: usize) -> Tally {
     let in_flight = Arc::new(Semaphore::new(max_in_flight));
-    let (sender, mut outcomes) = mpsc::unbounded_channel::<(Duration, Outcome)>();
+    let (sender, mut outcomes) = mpsc::channel::<(Duration, Outcome)>(2 * max_in_flight.max(1));
     let collector = tokio::spawn(async move {
         let mut tally = Tally::default();
         while let Some((latency, outcome)) = outcomes.recv().await {
@@ -109,13 +109,13 @@ async fn open_loop(target: &Arc<Target>, rate: f64, duration: Duration, max_in_f
         tokio::time::sleep_until(due.into()).await;
         let Ok(permit) = Arc::clone(&in_flight).try_acquire_owned() else {
             // The receiver lives until the last sender is dropped, so sending cannot fail here or below.
-            let _ = sender.send((Duration::ZERO, Outcome::NotSent));
+            let _ = sender.send((Duration::ZERO, Outcome::NotSent)).await;
             continue;
         };
         let (target, sender) = (Arc::clone(target), sender.clone());
         tokio::spawn(async move {
             let outcome = target.query(number as usize).await;
-            let _ = sender.send((due.elapsed(), outcome));
+            let _ = sender.send((due.elapsed(), outcome)).await;
             drop(permit);
         });
     }

@@ -81,14 +81,14 @@ impl FusedEncoder {
             let reason = format!("block {} was asked for, there are {}", spec.blocks() - 1, weights.blocks.len());
             return Err(InvalidValue::new("exit_block", reason).into());
         }
-        if size.width as usize % patch != 0 || size.height as usize % patch != 0 || size.width == 0 || size.height == 0
-        {
+        let whole = |side: u32| side > 0 && (side as usize).is_multiple_of(patch);
+        if !whole(size.width) || !whole(size.height) {
             return Err(
                 InvalidValue::new("input_size", format!("{size} is not whole patches of {patch} pixels")).into()
             );
         }
         let columns = Tiling::of(simd).columns;
-        if geometry.head_dim() % columns != 0 {
+        if !geometry.head_dim().is_multiple_of(columns) {
             let reason = format!(
                 "heads {} wide cannot be computed at level {}, which takes multiples of {columns}",
                 geometry.head_dim(),
