@@ -26,7 +26,7 @@ fn eval_needs_one_whole_description_of_the_data() {
         (&["eval", "--database", "a", "--queries", "b"], "--ground-truth"),
         (&["eval", "--dataset", "pitts300k", "--root", "x"], "pitts30k"),
         (&["eval", "--dataset", "utm", "--root", "/nowhere"], "@utm_east@utm_north@"),
-        (&["eval", "--dataset", "utm", "--root", "/nowhere", "--radius", "-1"], "radius"),
+        (&["eval", "--dataset", "utm", "--root", "/nowhere", "--radius=-1"], "radius"),
         (&["eval", "--dataset", "msls-val", "--root", "/nowhere"], "train_val/<city>"),
         (&["eval", "--dataset", "utm", "--root", "/nowhere", "--scales", "4"], "not a scale"),
     ] {

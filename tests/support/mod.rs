@@ -107,8 +107,8 @@ impl App {
     }
 
     pub fn open(directory: Arc<TempDir>, source: Arc<FakeSource>, change: impl FnOnce(&mut Config)) -> Self {
-        let mut config = Config::default();
-        config.store = StoreConfig { reserve_bytes: 1 << 20, ..Default::default() };
+        let store = StoreConfig { reserve_bytes: 1 << 20, ..Default::default() };
+        let mut config = Config { store, ..Default::default() };
         config.pipeline.disk_reserve_bytes = 0;
         change(&mut config);
         let (state, service) = open(directory.path(), source.clone(), config);

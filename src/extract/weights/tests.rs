@@ -104,7 +104,7 @@ fn every_fault_is_named_and_nothing_is_loaded() {
         found,
         [
             "blocks.12.norm1.bias [384] is unexpected",
-            "blocks.3.mlp.fc1.bias [384] is missing",
+            "blocks.3.mlp.fc1.bias [1536] is missing",
             "cls_token holds values that are not finite",
             "norm.weight is [768], not [384]",
         ]
