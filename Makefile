@@ -5,8 +5,7 @@ SHELL := bash
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
 # What `make test` and CI run, cheapest first.
-# Not among them yet: schemathesis and compose, each a target of its own.
-TEST_STEPS := fmt promtool deny clippy unit
+TEST_STEPS := fmt promtool deny clippy unit doc schemathesis compose
 PYTHON ?= python3
 FUZZ_SECONDS ?= 60
 MODEL ?= dinov2-vits14
@@ -30,6 +29,11 @@ demo: ## Serve a demo map, query it, leave a report in demo-report/
 head: ## Make the default projection head again (models/)
 	cargo build --release --locked
 	PLACEFORMER=$(RELEASE_BIN) models/make_head.sh
+
+.PHONY: calibration
+calibration: ## Fit the default model's calibration again (models/)
+	cargo build --release --locked
+	PLACEFORMER=$(RELEASE_BIN) models/make_calibration.sh
 
 .PHONY: bench
 bench: ## Measure every stage beside its baselines
@@ -87,7 +91,7 @@ promtool: ## Prometheus configuration and alert rules
 
 .PHONY: schemathesis
 schemathesis: model ## Generated requests against a live server
-	PLACEFORMER=$(DEBUG_BIN) tests/schemathesis.sh
+	BIN=$(DEBUG_BIN) tests/schemathesis.sh
 
 .PHONY: compose
 compose: model ## The composed system end to end (skips without Docker)

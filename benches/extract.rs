@@ -1,9 +1,11 @@
-//! Extraction of one image at the default preset: the fused encoder at every level of this CPU, beside the candle one.
+//! Extraction of one image at the default preset: the fused encoder at every level and precision of this CPU,
+//! beside the candle one.
 //! Weights are random, which costs the same as learned ones.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use placeformer::extract::{
-    BlockWeights, CandleEncoder, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm, Preset, VitWeights,
+    BlockWeights, CandleEncoder, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm, Precision, Preset,
+    VitWeights,
 };
 use placeformer::kernels::Simd;
 use placeformer::types::ImageTensor;
@@ -57,7 +59,15 @@ fn extract(criterion: &mut Criterion) {
     group.sample_size(10);
     let mut encoders: Vec<Box<dyn Encoder>> = Vec::new();
     for simd in Simd::all() {
-        encoders.push(Box::new(FusedEncoder::new(&weights, spec, simd).expect("the default spec suits the weights")));
+        let of_level = |precision| FusedEncoder::new(&weights, spec, simd, precision).ok();
+        let precisions = if simd == Simd::SCALAR {
+            &[Precision::F32][..]
+        } else {
+            &[Precision::F32, Precision::Bf16, Precision::Int8][..]
+        };
+        for encoder in precisions.iter().copied().filter_map(of_level) {
+            encoders.push(Box::new(encoder));
+        }
     }
     encoders.push(Box::new(CandleEncoder::new(&weights, &spec).expect("the default spec suits the weights")));
     for encoder in &encoders {

@@ -8,5 +8,5 @@ camvid=${CAMVID:-../shared/data/camvid}
 [ -d "$camvid" ] || { echo "no photographs in $camvid; set CAMVID" >&2; exit 1; }
 streets=$(mktemp -d)
 trap 'rm -rf "$streets"' EXIT
-"$placeformer" synth --out "$streets" --places 60 --views 2
+"$placeformer" synth --out "$streets" --places 60 --views 2 --seed 1
 "$placeformer" head fit --images "$camvid" "$streets" --out models/dinov2-vits14-b8.safetensors

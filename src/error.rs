@@ -66,6 +66,8 @@ error_codes! {
     ExternalIdConflict = "external_id_conflict", 409, false, "The external id is taken by another image";
     /// The map was built with another model.
     ModelMismatch = "model_mismatch", 409, false, "The map was built with another model";
+    /// The calibration belongs to another model or another re-ranking.
+    CalibrationMismatch = "calibration_mismatch", 409, false, "The calibration was fitted for something else";
     /// The body is larger than allowed.
     BodyTooLarge = "body_too_large", 413, false, "The body is too large";
     /// The image has more pixels, or a longer side, than allowed.
@@ -82,7 +84,7 @@ error_codes! {
     CorruptRecord = "corrupt_record", 500, false, "A stored record is damaged";
     /// A fault of the server.
     Internal = "internal", 500, true, "The server failed";
-    /// The queue is full.
+    /// The queue is full, or too long to wait in.
     Overloaded = "overloaded", 503, true, "The server is at capacity";
     /// Still starting.
     NotReady = "not_ready", 503, true, "The server is still starting";

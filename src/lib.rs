@@ -20,6 +20,7 @@
 //! | [`config`], [`ops`] | settings; metrics, logs, health, shutdown |
 //! | [`eval`], [`train`] | recall on data sets; learning the head and the backbone |
 //! | [`synth`], [`draw`] | the street renderer behind the demo map; pictures of matches |
+//! | [`bench`] | every stage beside a plain implementation and the machine's limit |
 //! | [`cli`] | one file per subcommand |
 //!
 //! Imports point one way, `http -> pipeline -> stages -> {types, error, kernels}`;
@@ -27,6 +28,7 @@
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 
+pub mod bench;
 pub mod cli;
 pub mod config;
 pub mod draw;

@@ -23,9 +23,10 @@ fn allowed(room: &str) -> Option<BTreeSet<&'static str>> {
         "config" => &["image", "extract", "search", "store", "rerank", "ops", "pipeline", "http"],
         "eval" => &["image", "extract", "search", "store", "rerank", "ops", "pipeline", "draw", "synth"],
         "train" => &["image", "extract", "search", "store", "rerank", "ops", "pipeline", "draw", "synth", "eval"],
+        "bench" => &["image", "extract", "search", "store", "rerank", "ops", "pipeline", "synth"],
         "cli" => &[
             "image", "extract", "search", "store", "rerank", "config", "ops", "pipeline", "http", "eval", "train",
-            "draw", "synth",
+            "draw", "synth", "bench",
         ],
         _ => return None,
     };
@@ -39,7 +40,7 @@ const CRATE_HOMES: &[(&str, &[&str])] = &[
     ("utoipa_swagger_ui", &["http"]),
     ("tower_http", &["http"]),
     ("rusqlite", &["store"]),
-    ("candle_core", &["extract", "train"]),
+    ("candle_core", &["extract", "train", "bench"]),
     ("candle_nn", &["extract", "train"]),
     ("zune_jpeg", &["image"]),
     ("anyhow", &["cli", "main"]),

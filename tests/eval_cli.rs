@@ -36,6 +36,33 @@ fn eval_needs_one_whole_description_of_the_data() {
 }
 
 #[test]
+fn eval_calibrate_takes_the_same_data_and_its_own_options() {
+    let folder = tempfile::tempdir().unwrap();
+    for (arguments, part) in [
+        (&["eval", "calibrate"][..], "--dataset"),
+        (&["eval", "calibrate", "--dataset", "pitts30k"], "--root"),
+        (&["eval", "calibrate", "--dataset", "utm", "--root", "/nowhere"], "@utm_east@utm_north@"),
+        (&["eval", "calibrate", "--dataset", "utm", "--root", "/nowhere", "--target-precision", "1.5"], "0.99"),
+        (&["eval", "calibrate", "--dataset", "utm", "--root", "/nowhere", "--candidates", "0"], "--candidates"),
+        (&["eval", "calibrate", "--dataset", "utm", "--root", "/nowhere", "--leave-out", "no"], "never"),
+        (&["eval", "calibrate", "--dataset", "utm", "--root", "/nowhere", "--no-rerank"], "--no-rerank"),
+        (&["eval", "--dataset", "utm", "--root", "/nowhere", "calibrate"], "calibrate"),
+    ] {
+        let error = refusal(arguments, folder.path());
+        assert!(error.contains(part), "{arguments:?}: {error}");
+    }
+}
+
+#[test]
+fn eval_calibrate_says_where_unknown_places_come_from() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = placeformer(&["eval", "calibrate", "--help"], folder.path());
+    let help = String::from_utf8_lossy(&output.stdout);
+    let flowing = help.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(output.status.success() && flowing.contains("its own place left out of the database"), "{help}");
+}
+
+#[test]
 fn eval_names_images_the_ground_truth_invents() {
     let folder = tempfile::tempdir().unwrap();
     for name in ["database/a.jpg", "queries/q.jpg"] {

@@ -6,7 +6,8 @@
 
 use placeformer::extract::pull::model_path;
 use placeformer::extract::{
-    ExtractConfig, ExtractionTrace, Extractor, HeadChoice, Preset, TraceArray, TraceValues, VitWeights,
+    ExtractConfig, ExtractError, ExtractionTrace, Extractor, HeadChoice, Precision, Preset, TraceArray, TraceValues,
+    VitWeights,
 };
 use placeformer::image::{ImageConfig, load_tensor};
 use placeformer::types::{ImageSize, ImageTensor};
@@ -36,7 +37,12 @@ fn weights() -> Option<&'static VitWeights> {
 }
 
 fn extractor(size: (u32, u32), exit_block: usize, token_norm: bool) -> Option<Extractor> {
+    extractor_at(Precision::F32, size, exit_block, token_norm)
+}
+
+fn extractor_at(precision: Precision, size: (u32, u32), exit_block: usize, token_norm: bool) -> Option<Extractor> {
     let config = ExtractConfig {
+        precision,
         input_size: Some(ImageSize { width: size.0, height: size.1 }),
         exit_block: Some(exit_block),
         token_norm: Some(token_norm),
@@ -215,7 +221,12 @@ fn the_paper_path_equals_the_reference() {
 fn attention_of_a_later_block_goes_with_tokens_of_an_earlier_one() {
     let Some(weights) = weights() else { return };
     let (size, image_size) = ((224, 224), ImageSize { width: 224, height: 224 });
-    let config = ExtractConfig { input_size: Some(image_size), attention_block: Some(11), ..ExtractConfig::default() };
+    let config = ExtractConfig {
+        input_size: Some(image_size),
+        attention_block: Some(11),
+        precision: Precision::F32,
+        ..ExtractConfig::default()
+    };
     let extractor = Extractor::from_weights(&config, weights, &HeadChoice::None).unwrap();
     let golden = Golden::load("street_a", size);
     let trace = extractor.trace(&golden.tensor(size)).unwrap();
@@ -238,6 +249,59 @@ fn a_batch_gives_bit_for_bit_what_single_images_give() {
         batch.iter().map(|image| extractor.extract(std::slice::from_ref(image)).unwrap().remove(0)).collect();
     assert_eq!(together, alone);
     assert_ne!(alone[0].pooled, alone[1].pooled);
+}
+
+/// What reduced precision costs, stage by stage, where this CPU has it.
+#[test]
+fn reduced_precision_stays_close_to_the_reference() {
+    let Some(weights) = weights() else { return };
+    for (precision, least, least_common) in [(Precision::Bf16, 0.9995, 0.95), (Precision::Int8, 0.99, 0.85)] {
+        for size in SIZES {
+            let input_size = Some(ImageSize { width: size.0, height: size.1 });
+            let config = ExtractConfig { precision, input_size, ..ExtractConfig::default() };
+            match Extractor::from_weights(&config, weights, &HeadChoice::None) {
+                Ok(extractor) => compare_reduced(&extractor, size, least, least_common),
+                Err(error @ ExtractError::Precision { .. }) => println!("left out here: {error}"),
+                Err(error) => panic!("{error}"),
+            }
+        }
+    }
+}
+
+/// The lowest cosine to the reference of any token, of the global descriptor and of any key patch both sides have, and
+/// the share of key patches both sides have.
+fn compare_reduced(extractor: &Extractor, size: (u32, u32), least: f32, least_common: f32) {
+    let golden = Golden::load("street_a", size);
+    let trace = extractor.trace(&golden.tensor(size)).unwrap();
+    let arrays = trace.arrays();
+    let tokens = arrays.iter().find(|array| array.name == "block8_tokens_rows").unwrap();
+    let TraceValues::F32(tokens) = &tokens.values else { panic!("tokens are f32") };
+    let expected = golden.floats["block8_tokens_rows"].chunks_exact(384);
+    let rows = golden.integers["rows"].iter().map(|&row| &tokens[row as usize * 384..][..384]);
+    let token = rows.zip(expected).map(|(a, b)| cosine(a, b)).fold(1.0, f32::min);
+    let global = cosine(&trace.global, &golden.floats["global_mean_block8_l2"]);
+    let (mut patch, mut common, mut of) = (1.0f32, 0, 0);
+    for (scale, keys) in (1..).zip(&trace.key_patches.scales) {
+        let index = &golden.integers[&format!("exit8_key{scale}_index")];
+        of += index.len();
+        for (at, expected) in index.iter().enumerate() {
+            let Some(own) = keys.index.iter().position(|&own| i64::from(own) == *expected) else { continue };
+            common += 1;
+            // All of them are stored, or the first 32.
+            let base = format!("exit8_key{scale}_descriptor");
+            let stored = golden.floats.get(&base).unwrap_or_else(|| &golden.floats[&format!("{base}_first32")]);
+            if let Some(expected) = stored.chunks_exact(384).nth(at) {
+                patch = patch.min(cosine(&keys.descriptors[own * 384..][..384], expected));
+            }
+        }
+    }
+    let shared = common as f32 / of as f32;
+    let name = extractor.encoder_name();
+    println!(
+        "{name} {size:?}: lowest cosine of tokens {token:.6}, global {global:.6}, key patches {patch:.6}; shared {shared:.3}"
+    );
+    assert!(token >= least && global >= least && patch >= least, "{name} {size:?}: {token} {global} {patch}");
+    assert!(shared >= least_common, "{name} {size:?}: only {shared} of the key patches are the reference's");
 }
 
 #[test]

@@ -198,6 +198,40 @@ fn assert_tensor_upright(bytes: &[u8], label: &str) {
 }
 
 #[test]
+fn a_large_photo_is_reduced_while_decoding_and_looks_the_same() {
+    // Waves of several lengths, so that what a reduction gets wrong would show.
+    let (width, height) = (2000u32, 1500u32);
+    let wave = |x: u32, y: u32, length: f32| 127.5 + 100.0 * ((x as f32 + 0.6 * y as f32) / length).sin();
+    let pixels = (0..height).flat_map(|y| {
+        (0..width).flat_map(move |x| [wave(x, y, 40.0) as u8, wave(y, x, 9.0) as u8, wave(x, y, 300.0) as u8])
+    });
+    let image = RgbImage { size: ImageSize { width, height }, pixels: pixels.collect() };
+    let jpeg = encode_jpeg(&image, 90).unwrap();
+    let config = ImageConfig::default();
+    let model = ImageSize { width: 448, height: 336 };
+    let turned = jpeg_with_exif(&jpeg, &exif_block(&[(Tag::Orientation, Value::Short(vec![6]))]));
+    for (bytes, name) in [(&jpeg, "upright"), (&turned, "turned")] {
+        let whole = decode(bytes, &config).unwrap().resized(model).unwrap();
+        let tensor = load_tensor(bytes, &config, model).unwrap();
+        let plane = (model.width * model.height) as usize;
+        let difference: f32 = (0..3 * plane)
+            .map(|at| {
+                let channel = at / plane;
+                let level = f32::from(whole.pixels[at % plane * 3 + channel]) / 255.0;
+                let (mean, deviation) = (placeformer::image::MEAN[channel], placeformer::image::DEVIATION[channel]);
+                (tensor.data[at] - (level - mean) / deviation).abs()
+            })
+            .sum::<f32>()
+            / (3 * plane) as f32;
+        assert!(difference < 0.02, "{name}: off by {difference} on average");
+    }
+    for cut in [jpeg.len() / 2, jpeg.len() - 2] {
+        let refused = load_tensor(&jpeg[..cut], &config, model).unwrap_err().to_string();
+        assert!(refused.contains("truncated"), "{refused}");
+    }
+}
+
+#[test]
 fn the_format_is_read_from_the_bytes() {
     assert_eq!(code(b""), "empty_image");
     assert_eq!(code(b"\xff"), "unsupported_media_type");

@@ -5,7 +5,10 @@ mod places;
 
 use placeformer::error::ErrorCode;
 use placeformer::store::{Inserted, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, StoreError};
-use placeformer::types::{GLOBAL_DIM, MapName, ModelId, NewReference, Reference, ReferenceId};
+use placeformer::types::{
+    Calibration, ConfidenceCurve, ConfidenceWeights, GLOBAL_DIM, MapName, ModelId, NewReference, Reference,
+    ReferenceId, RerankId,
+};
 use places::{MODEL, map, named_reference, reference};
 use std::collections::{BTreeMap, HashSet};
 use tempfile::TempDir;
@@ -29,6 +32,21 @@ fn create(store: &SqliteStore, new: NewReference) -> Reference {
         Inserted::Created(reference) => reference,
         Inserted::AlreadyThere(reference) => panic!("{reference:?} was there before"),
     }
+}
+
+/// A calibration for `model`.
+fn calibration(model: &str) -> Calibration {
+    let curve = |score| ConfidenceCurve {
+        weights: ConfidenceWeights { bias: -2.5, score, distance: -1.5 },
+        threshold: 0.75,
+        right: 80,
+        wrong: 60,
+        without_match: 50,
+        precision: 0.99,
+        recall: 0.875,
+        expected_calibration_error: 0.03125,
+    };
+    Calibration::new(ModelId::new(model), RerankId::new("r"), "town", 0.99, [curve(1.25), curve(0.0)]).unwrap()
 }
 
 fn globals(store: &SqliteStore, map: &MapName) -> BTreeMap<ReferenceId, Vec<f32>> {
@@ -73,7 +91,7 @@ fn absent_things_are_named() {
         store.delete_map(&nowhere).unwrap_err().code(),
         store.list(Some(&nowhere), None, 1).unwrap_err().code(),
         store.scan_globals(&nowhere, &mut |_| ()).unwrap_err().code(),
-        store.calibration(&nowhere).unwrap_err().code(),
+        store.set_calibration(&nowhere, Some(calibration(MODEL))).unwrap_err().code(),
     ];
     assert_eq!(codes, [ErrorCode::MapNotFound; 5]);
     assert!(store.get(nobody).unwrap_err().to_string().contains(&nobody.to_string()));
@@ -274,7 +292,7 @@ fn another_head_replaces_all_vectors_or_none_while_the_map_grows() {
     let city = map("city");
     let new: Vec<_> = (0..700).map(|seed| reference(&city, seed)).collect();
     assert!(store.insert_many(new).iter().all(Result::is_ok));
-    store.set_calibration(&city, Some(serde_json::json!({ "threshold": 3 }))).unwrap();
+    store.set_calibration(&city, Some(calibration(MODEL))).unwrap();
     let old = globals(&store, &city);
     let wrong = store.replace_globals(&city, ModelId::new("new"), &mut |_| vec![0.0; 7]);
     assert!(matches!(wrong, Err(StoreError::InvalidDescriptor { .. })));
@@ -297,7 +315,7 @@ fn another_head_replaces_all_vectors_or_none_while_the_map_grows() {
     store.replace_globals(&city, ModelId::new("new"), &mut compute).unwrap();
     let info = store.map(&city).unwrap();
     assert_eq!((info.model.as_str(), info.references), ("new", 700));
-    assert_eq!(store.calibration(&city).unwrap(), None);
+    assert_eq!(info.calibration, None);
     let now = globals(&store, &city);
     assert_eq!(now.len(), 700);
     let added = places::descriptor(9000, 20, 16).pooled;
@@ -308,18 +326,47 @@ fn another_head_replaces_all_vectors_or_none_while_the_map_grows() {
 }
 
 #[test]
-fn a_calibration_is_kept_with_its_map() {
+fn a_calibration_is_kept_with_its_map_and_only_if_it_is_of_its_model() {
+    let (directory, store) = fresh();
+    let (city, other) = (map("city"), map("other"));
+    create(&store, reference(&city, 1));
+    create(&store, reference(&other, 1));
+    let kept = |store: &SqliteStore, map: &MapName| store.map(map).unwrap().calibration;
+    assert_eq!(kept(&store, &city), None);
+    store.set_calibration(&city, Some(calibration(MODEL))).unwrap();
+    match store.set_calibration(&city, Some(calibration("another"))) {
+        Err(error @ StoreError::CalibrationMismatch { .. }) => {
+            assert_eq!(error.code(), ErrorCode::CalibrationMismatch);
+            assert!(error.to_string().contains(MODEL) && error.to_string().contains("another"), "{error}");
+        }
+        other => panic!("{other:?}"),
+    }
+    drop(store);
+    let store = open(&directory);
+    assert_eq!((kept(&store, &city), kept(&store, &other)), (Some(calibration(MODEL)), None));
+    assert_eq!(store.maps().unwrap()[0].calibration, Some(calibration(MODEL)));
+    store.set_calibration(&city, None).unwrap();
+    assert_eq!(kept(&store, &city), None);
+    // Clearing what is not there is no fault.
+    store.set_calibration(&city, None).unwrap();
+}
+
+#[test]
+fn a_calibration_changed_on_the_disk_is_noticed() {
     let (directory, store) = fresh();
     let city = map("city");
     create(&store, reference(&city, 1));
-    assert_eq!(store.calibration(&city).unwrap(), None);
-    let calibration = serde_json::json!({ "threshold": 12, "curve": [0.1, 0.9] });
-    store.set_calibration(&city, Some(calibration.clone())).unwrap();
+    store.set_calibration(&city, Some(calibration(MODEL))).unwrap();
     drop(store);
+    let path = directory.path().join("placeformer.db");
+    let change = |sql: &str| rusqlite::Connection::open(&path).unwrap().execute(sql, []).unwrap();
+    change("UPDATE map SET calibration = replace(calibration, '0.75', '0.05')");
     let store = open(&directory);
-    assert_eq!(store.calibration(&city).unwrap(), Some(calibration));
-    store.set_calibration(&city, None).unwrap();
-    assert_eq!(store.calibration(&city).unwrap(), None);
+    assert!(matches!(store.map(&city), Err(StoreError::CorruptMap { .. })));
+    drop(store);
+    change("UPDATE map SET calibration = replace(calibration, '0.05', '0.75')");
+    let store = open(&directory);
+    assert_eq!(store.map(&city).unwrap().calibration, Some(calibration(MODEL)));
 }
 
 #[test]

@@ -2,11 +2,14 @@
 
 #[path = "common/places.rs"]
 mod places;
+#[path = "common/small_disk.rs"]
+mod small_disk;
 
 use placeformer::store::{Inserted, PlaceStore, SqliteStore, StoreConfig, StoreError, codec, crash_points};
 use placeformer::types::{GLOBAL_DIM, MapName, ModelId, NewReference, Reference, ReferenceId};
 use places::{MODEL, map, named_reference, reference};
 use rand::{RngExt, SeedableRng};
+use small_disk::SmallDisk;
 use std::io::Write;
 use std::path::Path;
 use std::process::Command;
@@ -110,27 +113,6 @@ fn check_what_is_left(directory: &Path, said: &str, point: &str) {
 
 // ---------------------------------------------------------------- a full disk
 
-struct SmallDisk(tempfile::TempDir);
-
-impl SmallDisk {
-    /// A 10 MB file system in memory, where this process may mount one.
-    fn mount() -> Option<Self> {
-        let point = tempfile::tempdir().unwrap();
-        let mounted = Command::new("mount")
-            .args(["-t", "tmpfs", "-o", "size=10m", "tmpfs"])
-            .arg(point.path())
-            .output()
-            .is_ok_and(|output| output.status.success());
-        mounted.then_some(Self(point))
-    }
-}
-
-impl Drop for SmallDisk {
-    fn drop(&mut self) {
-        let _ = Command::new("umount").arg(self.0.path()).status();
-    }
-}
-
 /// A reference of the size that real ones have, about 120 kB.
 fn large(map: &MapName, seed: u64) -> NewReference {
     NewReference { descriptor: places::descriptor(seed, 300, 384), ..reference(map, seed) }
@@ -143,7 +125,7 @@ fn a_full_disk_refuses_new_references_but_serves_and_deletes() {
         return;
     };
     let (city, other) = (map("city"), map("other"));
-    let store = SqliteStore::open(disk.0.path(), &StoreConfig::default()).unwrap();
+    let store = SqliteStore::open(disk.path(), &StoreConfig::default()).unwrap();
     for round in 0..3 {
         let mut ids = Vec::new();
         let refused = loop {
@@ -156,10 +138,7 @@ fn a_full_disk_refuses_new_references_but_serves_and_deletes() {
         };
         assert!(matches!(refused, StoreError::DiskFull), "{refused}");
         assert!(ids.len() >= 15, "only {} references fit in round {round}", ids.len());
-        // Another process takes the very last bytes too.
-        let filler = disk.0.path().join("filler");
-        let mut file = std::fs::File::create(&filler).unwrap();
-        while file.write_all(&[1; 4096]).is_ok() {}
+        let filler = disk.fill();
         for (seed, id) in ids.iter().enumerate() {
             assert_eq!(store.patches(*id).unwrap(), large(&city, seed as u64).descriptor.patches);
         }

@@ -3,8 +3,8 @@
 Builds the truncated graph (tokens and CLS attention of one block, nothing later) from the safetensors that
 `placeformer model pull` stores, and times it. Results are checked against each other before anything is timed.
 
-    pip install openvino==2026.4.1 onnxruntime==1.32.0 onnx==1.23.2 numpy safetensors
-    python benches/peers/extract_openvino.py MODEL.safetensors [--size 448x336] [--exit-block 8] [--threads 2]
+    pip install -r benches/peers/requirements.txt
+    python benches/peers/extract_openvino.py MODEL.safetensors [--size 448x336] [--exit-block 8] [--threads 2] [--int8]
 
 Prints one JSON object: milliseconds per image by engine and batch, median and least, and the CPU time of all threads,
 which a busy machine disturbs least.
@@ -136,12 +136,19 @@ def fused_names(weights):
     return renamed
 
 
-def openvino_runner(model, threads, precision):
+def openvino_runner(model, threads, precision, calibration=None):
+    """A function from pixels to outputs; quantised to int8 with the images of `calibration` if there are any."""
     core = openvino.Core()
     options = {"INFERENCE_NUM_THREADS": threads, "INFERENCE_PRECISION_HINT": precision, "PERFORMANCE_HINT": "LATENCY"}
-    compiled = core.compile_model(core.read_model(model.SerializeToString(), b""), "CPU", options)
+    network = core.read_model(model.SerializeToString(), b"")
+    if calibration is not None:
+        import nncf
+
+        images = nncf.Dataset([image[None] for image in calibration])
+        network = nncf.quantize(network, images, model_type=nncf.ModelType.TRANSFORMER, subset_size=len(calibration))
+    compiled = core.compile_model(network, "CPU", options)
     request = compiled.create_infer_request()
-    return lambda pixels: list(request.infer({0: pixels}).values())
+    return lambda pixels: [value.copy() for value in request.infer({0: pixels}).values()]
 
 
 def onnxruntime_runner(model, threads):
@@ -169,18 +176,23 @@ def main():
     parser.add_argument("--exit-block", type=int, default=8)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repetitions", type=int, default=11)
+    parser.add_argument("--int8", action="store_true", help="also quantised by NNCF (takes a minute)")
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 8])
     arguments = parser.parse_args()
     width, height = map(int, arguments.size.split("x"))
     model = build(fused_names(load_file(arguments.weights)), width // PATCH, height // PATCH, arguments.exit_block)
+    pixels = np.random.default_rng(1).standard_normal((max(arguments.batches), 3, height, width)).astype(np.float32)
     runners = {
         "openvino-f32": openvino_runner(model, arguments.threads, "f32"),
         "onnxruntime-f32": onnxruntime_runner(model, arguments.threads),
     }
-    pixels = np.random.default_rng(1).standard_normal((max(arguments.batches), 3, height, width)).astype(np.float32)
     tokens = [run(pixels[:1])[0] for run in runners.values()]
     difference = float(np.abs(tokens[0] - tokens[1]).max())
     assert difference < 1e-2, f"the engines disagree by {difference}"
+    # Less exact ones are not held to the tolerance above.
+    runners["openvino-bf16"] = openvino_runner(model, arguments.threads, "bf16")
+    if arguments.int8:
+        runners["openvino-int8"] = openvino_runner(model, arguments.threads, "bf16", pixels)
     results = {
         f"{name}-batch{batch}": measure(run, pixels[:batch], arguments.repetitions)
         for name, run in runners.items()

@@ -2,6 +2,7 @@
 
 use anyhow::{Context, bail};
 use reqwest::blocking::{Client, RequestBuilder, Response};
+use serde::Serialize;
 use serde_json::Value;
 use std::path::Path;
 use std::time::Duration;
@@ -41,6 +42,11 @@ impl ServerClient {
     /// A DELETE of `path`.
     pub fn delete(&self, path: &str) -> anyhow::Result<Value> {
         self.json(self.client.delete(self.url(path)))
+    }
+
+    /// A PUT of a JSON body.
+    pub fn put_json(&self, path: &str, body: &impl Serialize) -> anyhow::Result<Value> {
+        self.json(self.client.put(self.url(path)).json(body))
     }
 
     /// A POST of an image file with query parameters.

@@ -2,6 +2,7 @@
 
 pub mod bench;
 mod client;
+mod data_args;
 pub mod demo;
 pub mod eval;
 pub mod extract;
@@ -51,7 +52,19 @@ pub enum Command {
     Head(head::HeadArgs),
     /// Measure recall on a data set.
     Eval(eval::EvalArgs),
-    /// Train the model.
+    /// Train the model: its head, or blocks of the backbone too.
+    ///
+    /// Triplets are formed from positions (positives within 10 m, negatives beyond 25 m) or from the order of frames;
+    /// before every cycle of steps the hardest negatives are found again. After every cycle recall is measured on
+    /// places that are not learnt from, the best weights are kept, and a checkpoint is written: the same command in
+    /// the same folder goes on from it, bit for bit as if nothing had happened.
+    ///
+    /// The run's folder holds train.jsonl (a line a cycle), checkpoint.safetensors, and at the end head.safetensors,
+    /// report.html and, where blocks were trained, weights.safetensors. Use them with --weights and --head, or name
+    /// the head in a server's configuration (extract.head). `map rehead` brings a map over to a new head without its
+    /// images.
+    ///
+    /// With --head none the head starts as a half-whitened PCA of the training images (more than 256 of them).
     Train(train::TrainArgs),
     /// Render synthetic street scenes.
     Synth(synth::SynthArgs),
@@ -67,7 +80,7 @@ pub enum Command {
     Healthcheck(healthcheck::HealthcheckArgs),
     /// Print the OpenAPI document.
     Openapi(openapi::OpenapiArgs),
-    /// Inspect and change maps.
+    /// Inspect and change maps; give them another head.
     Map(map::MapArgs),
 }
 

@@ -74,6 +74,10 @@ fn print_table(answer: &Value) {
     if results.is_empty() {
         println!("nothing in this map fits");
     }
+    if let (Some(matched), Some(confidence)) = (answer["matched"].as_bool(), answer["confidence"].as_f64()) {
+        let verdict = if matched { "trusted" } else { "not trusted" };
+        println!("the best answer is {verdict}: confidence {confidence:.3}");
+    }
     let stages = answer["timings_ms"].as_object().into_iter().flatten();
     let stages: Vec<String> =
         stages.map(|(stage, ms)| format!("{stage} {:.1}", ms.as_f64().unwrap_or_default())).collect();

@@ -74,7 +74,9 @@ fn loaders(config: &Config) -> Loaders {
     Loaders {
         source: Box::new(move || {
             let weights = crate::extract::pull::resolve_model(extract.preset, false)?;
-            Ok(Arc::new(Extractor::load(&extract, &weights, None)?))
+            let extractor = Extractor::load(&extract, &weights, None)?;
+            extractor.warm_up()?;
+            Ok(Arc::new(extractor))
         }),
         store: Box::new(move || open_store(&data, &store)),
     }

@@ -60,15 +60,14 @@ pub(super) const SECTIONS: &[(&str, Keys)] = &[
     (
         "pipeline",
         &[
-            ("queue_capacity", "Requests that may wait for or be in compute; beyond: 503 overloaded."),
-            ("max_batch", "Most images the model sees in one batch."),
+            ("queue_capacity", "Queries, and beside them references, waiting or in compute; beyond: 503 overloaded."),
+            ("max_wait_ms", "Longest wait of a query for its turn; one that would wait longer gets 503 at once."),
             ("patch_cache_bytes", "Key patches kept in memory for the next query."),
             ("top_k", "Results of a query that does not say."),
             ("candidates", "Candidates re-ranked for a query that does not say."),
             ("max_candidates", "Most results or candidates a query may ask for."),
             ("deadline_ms", "Time for a query that does not say, and the most it may ask for."),
             ("answer_reserve_ms", "Part of a query's time kept back for writing the answer."),
-            ("min_spatial_score", "S below which a best answer counts in query_unmatched_total."),
             (
                 "memory_watermark_bytes",
                 "Resident bytes above which nothing new is taken in; 0: 85% of what the process may use.",

@@ -116,13 +116,13 @@ impl Prepared {
         progress: &MultiProgress,
     ) -> Result<Self, EvalError> {
         let describer = open(extract)?;
-        let cache = FeatureCache::open(base.cache, describer.model(), base.memory_bytes)?;
+        let cache = FeatureCache::open(base.cache, &*describer, base.memory_bytes)?;
         let images = (dataset.database.len() + dataset.queries.len()) as u64;
         let bar = progress.add(ProgressBar::new(images).with_message("images"));
         let side = |items, name| cache.describe_all(&*describer, items, name, GlobalKind::Mean, &bar);
         let (database, queries) = (side(&dataset.database, "database")?, side(&dataset.queries, "query")?);
         bar.finish_and_clear();
-        let (answers, _) = search_all(&database, &queries, base.candidates);
+        let (answers, _) = search_all(&database, &queries, |_| base.candidates);
         Ok(Self { cache, database, queries, answers })
     }
 

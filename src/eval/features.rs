@@ -24,6 +24,10 @@ use std::time::Instant;
 pub trait Describe: Sync {
     /// Identity of everything the descriptors depend on.
     fn model(&self) -> &ModelId;
+    /// What computes them. Descriptors of one model compare whatever did, but a measurement must not mix them.
+    fn computed_by(&self) -> String {
+        String::new()
+    }
     /// Decodes and normalises; the error says what is wrong with the image.
     fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String>;
     /// One descriptor per image.
@@ -41,6 +45,10 @@ pub struct ModelDescriber {
 impl Describe for ModelDescriber {
     fn model(&self) -> &ModelId {
         self.extractor.model_id()
+    }
+
+    fn computed_by(&self) -> String {
+        self.extractor.encoder_name()
     }
 
     fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String> {
@@ -145,13 +153,14 @@ const CHUNK: usize = 32;
 const BATCH: usize = 4;
 
 impl FeatureCache {
-    /// Opens (and creates) the records of `model` below `root`, holding at most `memory_bytes` of key patches.
-    pub fn open(root: &Path, model: &ModelId, memory_bytes: u64) -> Result<Self, EvalError> {
-        let name = ContentHash::of(model.as_str().as_bytes()).to_string();
+    /// Opens (and creates) what `describer` recorded below `root`, holding at most `memory_bytes` of key patches.
+    pub fn open(root: &Path, describer: &dyn Describe, memory_bytes: u64) -> Result<Self, EvalError> {
+        let identity = format!("{} {}", describer.model(), describer.computed_by());
+        let name = ContentHash::of(identity.as_bytes()).to_string();
         let folder = root.join(&name[..16]);
         std::fs::create_dir_all(&folder).map_err(EvalError::io(&folder))?;
         let note = folder.join("model.txt");
-        std::fs::write(&note, model.as_str()).map_err(EvalError::io(&note))?;
+        std::fs::write(&note, identity).map_err(EvalError::io(&note))?;
         Ok(Self { folder, memory: Cache::with_weighter(4096, memory_bytes, PatchBytes) })
     }
 
@@ -445,7 +454,7 @@ mod tests {
     }
 
     fn run(describer: &FirstByte, root: &Path, items: &[Item], kind: GlobalKind) -> (FeatureCache, Features) {
-        let cache = FeatureCache::open(root, describer.model(), 1 << 20).unwrap();
+        let cache = FeatureCache::open(root, describer, 1 << 20).unwrap();
         let features = cache.describe_all(describer, items, "database", kind, &ProgressBar::hidden()).unwrap();
         (cache, features)
     }

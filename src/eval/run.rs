@@ -65,12 +65,13 @@ pub struct QuerySeconds {
     pub rerank: f64,
 }
 
-/// The `candidates` nearest database images of every readable query; the second value is the mean seconds per query.
-pub fn search_all(database: &Features, queries: &Features, candidates: usize) -> (Vec<Answer>, f64) {
+/// The nearest database images of every readable query, as many as `candidates` says for it; the second value is the
+/// mean seconds per query.
+pub fn search_all(database: &Features, queries: &Features, candidates: impl Fn(usize) -> usize) -> (Vec<Answer>, f64) {
     let searcher = Searcher::new(database);
     let start = Instant::now();
     let answer = |query: usize| {
-        let global = searcher.search(queries.global(query)?, candidates);
+        let global = searcher.search(queries.global(query)?, candidates(query));
         Some(Answer { query, global, reranked: Vec::new() })
     };
     let answers: Vec<Answer> = (0..queries.len()).filter_map(answer).collect();

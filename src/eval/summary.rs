@@ -1,13 +1,14 @@
 //! Everything measured in one run, as one value: printed, written as JSON, drawn in the report.
 
 use super::EvalError;
+use super::calibrate::{Applied, BestAnswers, shipped_curve};
 use super::datasets::{Dataset, Skipped, Truth};
 use super::features::{Features, GlobalKind, Unreadable};
-use super::measure::{self, Calibration, Interval, Judged, PoseAccuracy, RECALL_AT, Rejection, ReliabilityBin, TopOne};
+use super::measure::{self, Interval, Judged, PoseAccuracy, RECALL_AT, Rejection, ReliabilityBin};
 use super::run::{Answer, QuerySeconds};
 use crate::extract::ExtractConfig;
 use crate::rerank::RerankConfig;
-use crate::types::ModelId;
+use crate::types::{ConfidenceWeights, ModelId};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -69,7 +70,7 @@ pub struct Bytes {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CalibrationSummary {
     /// Fitted on all judged queries.
-    pub fitted: Calibration,
+    pub fitted: ConfidenceWeights,
     /// 0 to 1, of predictions made by five-fold cross-validation.
     pub expected_calibration_error: f64,
     /// Of the same predictions.
@@ -138,6 +139,10 @@ pub struct Summary {
     /// Probability of being right from S and distance; absent if answers of both kinds are too few.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub calibration: Option<CalibrationSummary>,
+    /// What the calibration that the program carries for this model comes to on these queries, after re-ranking if
+    /// that was done; absent if it carries none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub shipped_calibration: Option<Applied>,
     /// Mean seconds per image and per query.
     pub seconds: Seconds,
     /// Mean bytes of one reference.
@@ -196,6 +201,7 @@ pub fn summarise(
     let all: Vec<&Answer> = answers.iter().collect();
     let judged: Vec<&Answer> = all.iter().copied().filter(|a| dataset.truth[a.query] != Truth::Unknown).collect();
     let with_match = view.with_match(&all);
+    let best = BestAnswers::of(dataset, answers);
     let mut unreadable = database.unreadable.clone();
     unreadable.extend(queries.unreadable.iter().cloned());
     let bytes = Bytes {
@@ -220,7 +226,8 @@ pub fn summarise(
         rejection: Both::of(view.reranked, |stage| measure::rejection(&view.judged(&judged, stage))),
         poses: view.poses(&all),
         groups: view.groups(&all),
-        calibration: view.calibration(&judged, config.seed),
+        calibration: fitted_here(&best, config.seed),
+        shipped_calibration: shipped_here(&best, &config),
         seconds: Seconds {
             decode: database.seconds.decode,
             extract: database.seconds.extract,
@@ -340,25 +347,27 @@ impl<'a> View<'a> {
         };
         groups.into_iter().map(summary).collect()
     }
+}
 
-    fn calibration(&self, judged: &[&Answer], seed: u64) -> Option<CalibrationSummary> {
-        let top = |answer: &&Answer| {
-            let best = answer.reranked.first()?;
-            Some(TopOne {
-                spatial_score: f64::from(best.score.spatial_score),
-                global_distance: f64::from(best.distance),
-                correct: self.positives(answer).binary_search(&best.index).is_ok(),
-            })
-        };
-        let answers: Vec<TopOne> = judged.iter().filter_map(top).collect();
-        let right = answers.iter().filter(|answer| answer.correct).count();
-        if right.min(answers.len() - right) < CALIBRATION_MINIMUM {
-            return None;
-        }
-        let fitted = measure::fit(&answers, measure::RIDGE).ok()?;
-        let bins = measure::reliability(&measure::cross_validate(&answers, measure::RIDGE, 5, seed));
-        Some(CalibrationSummary { fitted, expected_calibration_error: measure::calibration_error(&bins), bins })
+/// A probability fitted to these very answers, if there are enough of both kinds.
+fn fitted_here(best: &BestAnswers, seed: u64) -> Option<CalibrationSummary> {
+    let answers = &best.reranked;
+    let right = answers.iter().filter(|answer| answer.correct).count();
+    if right.min(answers.len() - right) < CALIBRATION_MINIMUM {
+        return None;
     }
+    let fitted = measure::fit(answers, measure::RIDGE).ok()?;
+    let bins = measure::reliability(&measure::cross_validate(answers, measure::RIDGE, measure::FOLDS, seed));
+    Some(CalibrationSummary { fitted, expected_calibration_error: measure::calibration_error(&bins), bins })
+}
+
+/// What the model's own curve comes to on these answers.
+fn shipped_here(best: &BestAnswers, config: &RunConfig) -> Option<Applied> {
+    let rerank = config.rerank.as_ref().map(RerankConfig::id);
+    // Distances without the head are of another kind.
+    let curve = (config.global == GlobalKind::Head).then(|| shipped_curve(&config.model, rerank.as_ref()))??;
+    let answers = if rerank.is_some() { &best.reranked } else { &best.global };
+    (!answers.is_empty()).then(|| Applied::of(&curve, answers))
 }
 
 #[cfg(test)]

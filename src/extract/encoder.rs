@@ -85,7 +85,7 @@ pub trait Encoder: Send + Sync {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// The fastest the machine has that loses no recall to speak of.
+    /// The fastest of which no loss of recall has been measured: f32.
     #[default]
     Auto,
     /// 32-bit floats.

@@ -101,6 +101,25 @@ pub enum ExtractError {
     /// The tensor library failed.
     #[error("computing the transformer failed: {0}")]
     Compute(String),
+    /// A map keeps pooled vectors that the head cannot take.
+    #[error(
+        "the map keeps pooled vectors made by {stored}, the head takes those of {head}: one cannot be made of the other \
+         without the images; import them anew with this head, or use a head of {stored}"
+    )]
+    AggregateMismatch {
+        /// How the stored vectors were pooled.
+        stored: String,
+        /// How the head's would be.
+        head: String,
+    },
+    /// Too few tokens to learn visual words from.
+    #[error("{words} visual words cannot be learnt from {tokens} tokens")]
+    TooFewTokens {
+        /// Words asked for.
+        words: usize,
+        /// Tokens given.
+        tokens: usize,
+    },
     /// Too few images to fit a head.
     #[error("a head of {dim} dimensions needs more than {dim} images, got {images}")]
     TooFewImages {
@@ -121,7 +140,9 @@ impl ExtractError {
         match self {
             Self::Simd(error) => error.code(),
             Self::Config(_) => ErrorCode::InvalidParameter,
-            Self::HeadMismatch { .. } | Self::NoHead { .. } => ErrorCode::ModelMismatch,
+            Self::HeadMismatch { .. } | Self::NoHead { .. } | Self::AggregateMismatch { .. } => {
+                ErrorCode::ModelMismatch
+            }
             Self::Io { .. }
             | Self::BadFile { .. }
             | Self::WrongTensors { .. }
@@ -131,6 +152,7 @@ impl ExtractError {
             | Self::NotFinite
             | Self::Precision { .. }
             | Self::Compute(_)
+            | Self::TooFewTokens { .. }
             | Self::TooFewImages { .. } => ErrorCode::Internal,
         }
     }

@@ -1,19 +1,17 @@
 //! Weights, head and settings put together: from normalised images to descriptors.
 
+use super::aggregate::Aggregate;
 use super::config::{ExtractConfig, HeadChoice};
 use super::encoder::{EncodedImage, Encoder, EncoderSpec, Precision, check_image, token_grid};
 use super::error::ExtractError;
 use super::fused::FusedEncoder;
-use super::global::{l2_normalise, mean_token};
 use super::head::Head;
 use super::preset::Geometry;
 use super::trace::ExtractionTrace;
 use super::weights::VitWeights;
-use super::{fusion, positions, record, selection};
+use super::{fusion, model_id, positions, record, selection};
 use crate::kernels;
-use crate::types::{
-    Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid, PoolingStride,
-};
+use crate::types::{Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid};
 use std::path::Path;
 
 /// A loaded model with its head.
@@ -47,9 +45,9 @@ impl Extractor {
         let spec = config.encoder_spec()?;
         let geometry = weights.geometry;
         let grid = token_grid(&geometry, &spec);
-        let backbone = backbone_id(config, &spec, weights);
+        let backbone = model_id::backbone_id(config, &spec, weights);
         let head = choose_head(head, &backbone, geometry.dim)?;
-        let model_id = compose_model_id(&backbone, config, &spec, head.as_ref());
+        let model_id = model_id::compose(&backbone, config, &spec, head.as_ref());
         let (from, to) = (weights.position_grid, (grid.rows, grid.columns));
         Ok(Self {
             config: config.effective()?,
@@ -103,7 +101,7 @@ impl Extractor {
         if self.head.is_some() { GLOBAL_DIM } else { self.geometry.dim }
     }
 
-    /// Length of a key patch's descriptor and of the pooled token.
+    /// Length of a token and of a key patch's descriptor.
     pub fn dim(&self) -> usize {
         self.geometry.dim
     }
@@ -121,7 +119,7 @@ impl Extractor {
     /// One descriptor per image; a batch gives bit for bit what single images give.
     pub fn extract(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
         let describe = |encoded: &EncodedImage| {
-            let pooled = self.pool(encoded)?;
+            let pooled = pool(encoded, self.aggregate())?;
             let global = self.global(&pooled);
             Ok(Descriptor { global, pooled, patches: PackedPatches::quantise(&self.key_patches(encoded)) })
         };
@@ -131,16 +129,26 @@ impl Extractor {
     /// Key patches in full precision beside the descriptor, for measuring what quantisation costs.
     pub fn extract_full(&self, images: &[ImageTensor]) -> Result<Vec<(Descriptor, KeyPatches)>, ExtractError> {
         let describe = |encoded: &EncodedImage| {
-            let pooled = self.pool(encoded)?;
+            let pooled = pool(encoded, self.aggregate())?;
             let (global, keys) = (self.global(&pooled), self.key_patches(encoded));
             Ok((Descriptor { global, pooled, patches: PackedPatches::quantise(&keys) }, keys))
         };
         self.encoder.encode(images)?.iter().map(describe).collect()
     }
 
-    /// The L2-normalised mean token of each image: all that fitting or training a head needs.
+    /// The pooled tokens of each image, by the head's own aggregate: all that training a head needs.
     pub fn pooled(&self, images: &[ImageTensor]) -> Result<Vec<Vec<f32>>, ExtractError> {
-        self.encoder.encode(images)?.iter().map(|encoded| self.pool(encoded)).collect()
+        self.pooled_by(images, self.aggregate())
+    }
+
+    /// The tokens of each image pooled by `aggregate`, of unit length, for fitting a head of it.
+    pub fn pooled_by(&self, images: &[ImageTensor], aggregate: &Aggregate) -> Result<Vec<Vec<f32>>, ExtractError> {
+        self.encoder.encode(images)?.iter().map(|encoded| pool(encoded, aggregate)).collect()
+    }
+
+    /// How tokens become the vector that the head takes; the mean where there is no head.
+    pub fn aggregate(&self) -> &Aggregate {
+        self.head.as_ref().map_or(&Aggregate::Mean, Head::aggregate)
     }
 
     /// Tokens and attention of each image, as the transformer gives them.
@@ -152,9 +160,10 @@ impl Extractor {
     pub fn trace(&self, image: &ImageTensor) -> Result<ExtractionTrace, ExtractError> {
         check_image(image, self.encoder.spec())?;
         let encoded = self.encoder.encode(std::slice::from_ref(image))?.remove(0);
-        let pooled = self.pool(&encoded)?;
+        let pooled = pool(&encoded, self.aggregate())?;
         Ok(ExtractionTrace {
             spec: *self.encoder.spec(),
+            pooling: self.aggregate().kind(),
             depth: self.geometry.depth,
             image: image.clone(),
             positions: self.positions.clone(),
@@ -174,15 +183,6 @@ impl Extractor {
         self.extract(&[ImageTensor { size, data }]).map(drop)
     }
 
-    fn pool(&self, encoded: &EncodedImage) -> Result<Vec<f32>, ExtractError> {
-        let mut pooled = mean_token(&encoded.tokens, encoded.dim);
-        if pooled.iter().chain(&encoded.cls_attention).any(|value| !value.is_finite()) {
-            return Err(ExtractError::NotFinite);
-        }
-        l2_normalise(&mut pooled);
-        Ok(pooled)
-    }
-
     fn global(&self, pooled: &[f32]) -> Vec<f32> {
         self.head.as_ref().map_or_else(|| pooled.to_vec(), |head| head.project(pooled))
     }
@@ -199,46 +199,22 @@ impl Extractor {
     }
 }
 
+fn pool(encoded: &EncodedImage, aggregate: &Aggregate) -> Result<Vec<f32>, ExtractError> {
+    let pooled = aggregate.pool(&encoded.tokens, encoded.dim);
+    if pooled.iter().chain(&encoded.cls_attention).any(|value| !value.is_finite()) {
+        return Err(ExtractError::NotFinite);
+    }
+    Ok(pooled)
+}
+
 /// The encoder for `precision`, after every kernel it may use has agreed with its scalar twin on this machine.
 pub fn build_encoder(
     weights: &VitWeights,
     spec: &EncoderSpec,
     precision: Precision,
 ) -> Result<Box<dyn Encoder>, ExtractError> {
-    let unavailable = |precision| {
-        let reason = "only f32 is implemented".into();
-        Err(ExtractError::Precision { precision, reason })
-    };
     let simd = kernels::self_check()?;
-    match precision {
-        Precision::Auto | Precision::F32 => Ok(Box::new(FusedEncoder::new(weights, *spec, simd)?)),
-        Precision::Bf16 => unavailable("bf16"),
-        Precision::Int8 => unavailable("int8"),
-    }
-}
-
-/// Preset, weights, heads where they are not the preset's, exit block with an `n` for normed tokens:
-/// `dinov2-vits14:0f1e2d3c4b5a:b8`. A head depends on these and nothing else.
-fn backbone_id(config: &ExtractConfig, spec: &EncoderSpec, weights: &VitWeights) -> String {
-    let heads = match weights.geometry.heads {
-        heads if heads == config.preset.geometry().heads => String::new(),
-        heads => format!(":heads{heads}"),
-    };
-    let norm = if spec.token_norm { "n" } else { "" };
-    format!("{}:{}{heads}:b{}{norm}", config.preset, &weights.content_hash()[..12], spec.exit_block)
-}
-
-/// The backbone, then everything else a descriptor depends on. The precision is left out on purpose: descriptors of one
-/// model compare across precisions.
-fn compose_model_id(backbone: &str, config: &ExtractConfig, spec: &EncoderSpec, head: Option<&Head>) -> ModelId {
-    let attention = match spec.attention_block {
-        block if block == spec.exit_block => String::new(),
-        block => format!(":a{block}"),
-    };
-    let stride = if config.stride == PoolingStride::Kernel { "" } else { ":dense" };
-    let caps = config.caps.map(|cap| cap.to_string()).join("-");
-    let head = head.map_or("none".to_owned(), |head| head.content_hash()[..12].to_owned());
-    ModelId::new(format!("{backbone}:{}{attention}:t{}:k{caps}{stride}:h{head}", spec.input_size, config.tau))
+    Ok(Box::new(FusedEncoder::new(weights, *spec, simd, precision)?))
 }
 
 fn choose_head(choice: &HeadChoice, backbone: &str, dim: usize) -> Result<Option<Head>, ExtractError> {
@@ -250,8 +226,8 @@ fn choose_head(choice: &HeadChoice, backbone: &str, dim: usize) -> Result<Option
         },
         HeadChoice::File(path) => (Head::load(path)?, Some(path.clone())),
     };
-    if head.backbone() != backbone || head.dim() != dim {
-        let head_backbone = format!("{} ({}-d)", head.backbone(), head.dim());
+    if head.backbone() != backbone || head.token_dim() != dim {
+        let head_backbone = format!("{} ({}-d)", head.backbone(), head.token_dim());
         return Err(ExtractError::HeadMismatch { path, head_backbone, backbone: format!("{backbone} ({dim}-d)") });
     }
     Ok(Some(head))

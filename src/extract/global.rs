@@ -1,4 +1,4 @@
-//! The global descriptor: mean over patch tokens, L2-normalised (paper III-A); the head then projects it.
+//! The mean over patch tokens, L2-normalised (paper III-A); the head then projects it to the global descriptor.
 
 /// Mean of the tokens `[n, dim]`, summed in f64 so that the order of n hundred values does not matter.
 pub fn mean_token(tokens: &[f32], dim: usize) -> Vec<f32> {

@@ -1,9 +1,12 @@
-//! The linear projection from the pooled token to the global descriptor (paper III-A), bound to one backbone.
+//! The linear projection from the pooled tokens to the global descriptor (paper III-A), bound to one backbone.
 //!
 //! A head is a small safetensors file: `weight` `[256, d]`, `bias` `[256]`, and metadata that says which backbone's
-//! tokens it was made for. It is applied to the L2-normalised mean token, and its output is L2-normalised. Heads for the
-//! models that ship are built into the binary.
+//! tokens it was made for, and how these are pooled: `aggregate` is `mean` (also where it is missing), `gem` with its
+//! power in a tensor `gem_p` `[1]`, or `vlad` with its words in `vlad_words` `[k, token width]`, for which d is k times
+//! that width. It is applied to the L2-normalised pooled vector, and its output is L2-normalised. Heads for the models
+//! that ship are built into the binary.
 
+use super::aggregate::{Aggregate, VladWords};
 use super::error::ExtractError;
 use super::global::l2_normalise;
 use super::weights::{hex, to_f32, write_atomically};
@@ -16,9 +19,10 @@ use std::path::Path;
 /// Heads that ship, one per backbone.
 const BUILT_IN: [&[u8]; 1] = [include_bytes!("../../models/dinov2-vits14-b8.safetensors")];
 
-/// A projection d -> 256.
+/// A projection d -> 256, and the pooling before it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Head {
+    aggregate: Aggregate,
     /// `[256, dim]` row-major.
     weight: Vec<f32>,
     /// `[256]`.
@@ -31,23 +35,41 @@ pub struct Head {
 }
 
 impl Head {
-    /// Builds a head for `backbone` from `weight` `[256, dim]` and `bias` `[256]`; `notes` say how it was made.
+    /// Builds a head for `backbone` from `weight` `[256, d]` and `bias` `[256]`, where d is the length of what
+    /// `aggregate` makes; `notes` say how it was made.
     pub fn new(
+        aggregate: Aggregate,
         weight: Vec<f32>,
         bias: Vec<f32>,
         backbone: impl Into<String>,
         notes: BTreeMap<String, String>,
     ) -> Result<Self, ExtractError> {
+        let bad = |reason| Err(ExtractError::BadFile { path: "head".into(), reason });
         let dim = weight.len() / GLOBAL_DIM;
         let finite = weight.iter().chain(&bias).all(|value| value.is_finite());
         if dim == 0 || weight.len() != dim * GLOBAL_DIM || bias.len() != GLOBAL_DIM || !finite {
-            let reason = format!("a head needs a finite [{GLOBAL_DIM}, d] weight and a [{GLOBAL_DIM}] bias");
-            return Err(ExtractError::BadFile { path: "head".into(), reason });
+            return bad(format!("a head needs a finite [{GLOBAL_DIM}, d] weight and a [{GLOBAL_DIM}] bias"));
         }
-        Ok(Self { weight, bias, dim, backbone: backbone.into(), notes })
+        if let Aggregate::Vlad(words) = &aggregate
+            && words.values().len() != dim
+        {
+            let length = words.values().len();
+            return bad(format!("weight takes {dim} values, its {} visual words make {length}", words.count()));
+        }
+        Ok(Self { aggregate, weight, bias, dim, backbone: backbone.into(), notes })
     }
 
-    /// Loads a head file; refuses anything but its two tensors and its metadata.
+    /// The same head with another `weight` `[256, d]` and `bias` `[256]`, as training makes it, and other notes.
+    pub fn with_weights(
+        &self,
+        weight: Vec<f32>,
+        bias: Vec<f32>,
+        notes: BTreeMap<String, String>,
+    ) -> Result<Self, ExtractError> {
+        Self::new(self.aggregate.clone(), weight, bias, self.backbone.clone(), notes)
+    }
+
+    /// Loads a head file; refuses anything but its tensors and its metadata.
     pub fn load(path: &Path) -> Result<Self, ExtractError> {
         Self::from_bytes(&std::fs::read(path).map_err(ExtractError::io(path))?, path)
     }
@@ -71,42 +93,62 @@ impl Head {
         let tensors = SafeTensors::deserialize(bytes).map_err(broken)?;
         let mut notes: BTreeMap<_, _> = metadata.metadata().clone().unwrap_or_default().into_iter().collect();
         let backbone = notes.remove("backbone").ok_or_else(|| bad("no head: its metadata names no backbone".into()))?;
-        if let Some(name) = tensors.names().into_iter().find(|name| !["weight", "bias"].contains(name)) {
-            return Err(bad(format!("unexpected tensor {name}; a head holds weight and bias")));
-        }
-        let take = |name: &str| {
-            let view = tensors.tensor(name).map_err(|_| bad(format!("{name} is missing")))?;
-            let right = match *view.shape() {
-                [GLOBAL_DIM, dim] => name == "weight" && dim > 0,
-                [GLOBAL_DIM] => name == "bias",
-                _ => false,
-            };
-            match to_f32(&view).filter(|_| right) {
-                Some(values) if values.iter().all(|v| v.is_finite()) => Ok(values),
-                Some(_) => Err(bad(format!("{name} holds values that are not finite"))),
-                None => {
-                    Err(bad(format!("{name} is {:?} {:?}, not a float [256, d] or [256]", view.dtype(), view.shape())))
-                }
-            }
-        };
-        Self::new(take("weight")?, take("bias")?, backbone, notes)
+        let kind = notes.remove("aggregate").unwrap_or_else(|| "mean".into());
+        let file = HeadFile { tensors: &tensors, path };
+        let aggregate = file.aggregate(&kind)?;
+        let (weight, bias) = (file.take("weight", &[GLOBAL_DIM, 0])?, file.take("bias", &[GLOBAL_DIM])?);
+        // Told with the file's own path, which `new` does not know.
+        Self::new(aggregate, weight, bias, backbone, notes).map_err(|error| match error {
+            ExtractError::BadFile { reason, .. } => bad(reason),
+            other => other,
+        })
     }
 
     /// Writes the head, atomically.
     pub fn save(&self, path: &Path) -> Result<(), ExtractError> {
         let bad =
             |e: safetensors::SafeTensorError| ExtractError::BadFile { path: path.to_owned(), reason: e.to_string() };
-        let weight = TensorView::new(Dtype::F32, vec![GLOBAL_DIM, self.dim], bytemuck::cast_slice(&self.weight));
-        let bias = TensorView::new(Dtype::F32, vec![GLOBAL_DIM], bytemuck::cast_slice(&self.bias));
+        let view = |shape: Vec<usize>, values| {
+            TensorView::new(Dtype::F32, shape, bytemuck::cast_slice::<f32, u8>(values)).map_err(bad)
+        };
+        let mut tensors = vec![
+            ("weight", view(vec![GLOBAL_DIM, self.dim], &self.weight)?),
+            ("bias", view(vec![GLOBAL_DIM], &self.bias)?),
+        ];
+        match &self.aggregate {
+            Aggregate::Mean => {}
+            Aggregate::Gem { p } => tensors.push((GEM_P, view(vec![1], std::slice::from_ref(p))?)),
+            Aggregate::Vlad(words) => {
+                tensors.push((VLAD_WORDS, view(vec![words.count(), words.dim()], words.values())?));
+            }
+        }
         let mut metadata: HashMap<String, String> = self.notes.clone().into_iter().collect();
         metadata.insert("backbone".into(), self.backbone.clone());
-        let tensors = [("weight", weight.map_err(bad)?), ("bias", bias.map_err(bad)?)];
+        metadata.insert("aggregate".into(), self.aggregate.kind().into());
         write_atomically(path, &safetensors::serialize(tensors, Some(metadata)).map_err(bad)?)
     }
 
-    /// Width of the tokens it takes.
+    /// Length of the pooled vector it takes.
     pub fn dim(&self) -> usize {
         self.dim
+    }
+
+    /// Width of the tokens that are pooled.
+    pub fn token_dim(&self) -> usize {
+        match &self.aggregate {
+            Aggregate::Mean | Aggregate::Gem { .. } => self.dim,
+            Aggregate::Vlad(words) => words.dim(),
+        }
+    }
+
+    /// How the tokens are pooled before it.
+    pub fn aggregate(&self) -> &Aggregate {
+        &self.aggregate
+    }
+
+    /// Its weight, `[256, dim]` row-major, and its bias, `[256]`.
+    pub fn weights(&self) -> (&[f32], &[f32]) {
+        (&self.weight, &self.bias)
     }
 
     /// The backbone whose tokens it takes, as [`crate::extract::Extractor::backbone`] writes it.
@@ -119,15 +161,16 @@ impl Head {
         &self.notes
     }
 
-    /// SHA-256 over weight and bias, hexadecimal: the head's part of a `ModelId`.
+    /// SHA-256 over weight, bias and what the aggregate has of its own, hexadecimal: the head's part of a `ModelId`.
     pub fn content_hash(&self) -> String {
         let mut hasher = Sha256::new();
         hasher.update(bytemuck::cast_slice::<f32, u8>(&self.weight));
         hasher.update(bytemuck::cast_slice::<f32, u8>(&self.bias));
+        self.aggregate.hash_into(&mut hasher);
         hex(&hasher.finalize())
     }
 
-    /// The global descriptor `[256]` of an L2-normalised pooled token `[dim]`.
+    /// The global descriptor `[256]` of an L2-normalised pooled vector `[dim]`.
     pub fn project(&self, pooled: &[f32]) -> Vec<f32> {
         let mut global: Vec<f32> = self.affine(pooled).iter().map(|&value| value as f32).collect();
         l2_normalise(&mut global);
@@ -144,6 +187,61 @@ impl Head {
     }
 }
 
+const GEM_P: &str = "gem_p";
+const VLAD_WORDS: &str = "vlad_words";
+
+/// The tensors of a head's file, taken by name; `path` is named in errors.
+struct HeadFile<'a> {
+    tensors: &'a SafeTensors<'a>,
+    path: &'a Path,
+}
+
+impl HeadFile<'_> {
+    fn bad(&self, reason: String) -> ExtractError {
+        ExtractError::BadFile { path: self.path.to_owned(), reason }
+    }
+
+    /// The aggregate of this kind; refuses tensors that a head of this kind does not have.
+    fn aggregate(&self, kind: &str) -> Result<Aggregate, ExtractError> {
+        let own: &[&str] = match kind {
+            "mean" => &["weight", "bias"],
+            "gem" => &["weight", "bias", GEM_P],
+            "vlad" => &["weight", "bias", VLAD_WORDS],
+            _ => return Err(self.bad(format!("its aggregate {kind:?} is not one of mean, gem, vlad"))),
+        };
+        if let Some(name) = self.tensors.names().into_iter().find(|name| !own.contains(name)) {
+            return Err(self.bad(format!("unexpected tensor {name}; a {kind} head holds {}", own.join(", "))));
+        }
+        match kind {
+            "gem" => Aggregate::gem(self.take(GEM_P, &[1])?[0]).map_err(|reason| self.bad(reason)),
+            "vlad" => {
+                let values = self.take(VLAD_WORDS, &[0, 0])?;
+                let words = self.tensors.tensor(VLAD_WORDS).map_or(1, |view| view.shape()[0]);
+                let dim = values.len() / words;
+                VladWords::new(values, dim).map(Aggregate::Vlad).map_err(|reason| self.bad(reason))
+            }
+            _ => Ok(Aggregate::Mean),
+        }
+    }
+
+    /// The values of a tensor of `shape`, in which 0 stands for any positive number.
+    fn take(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>, ExtractError> {
+        let view = self.tensors.tensor(name).map_err(|_| self.bad(format!("{name} is missing")))?;
+        let fits = |(&found, &asked): (&usize, &usize)| found > 0 && (asked == 0 || asked == found);
+        let right = view.shape().len() == shape.len() && view.shape().iter().zip(shape).all(fits);
+        match to_f32(&view).filter(|_| right) {
+            Some(values) if values.iter().all(|v| v.is_finite()) => Ok(values),
+            Some(_) => Err(self.bad(format!("{name} holds values that are not finite"))),
+            None => {
+                let asked: Vec<String> =
+                    shape.iter().map(|&side| if side == 0 { "any".into() } else { side.to_string() }).collect();
+                let (dtype, found) = (view.dtype(), view.shape());
+                Err(self.bad(format!("{name} is {dtype:?} {found:?}, not a float [{}]", asked.join(", "))))
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -151,7 +249,7 @@ mod tests {
     fn head() -> Head {
         let weight = (0..GLOBAL_DIM * 8).map(|i| ((i * 37) % 101) as f32 / 50.0 - 1.0).collect();
         let notes = [("method".to_owned(), "test".to_owned())].into();
-        Head::new(weight, vec![0.5; GLOBAL_DIM], "backbone-x", notes).unwrap()
+        Head::new(Aggregate::Mean, weight, vec![0.5; GLOBAL_DIM], "backbone-x", notes).unwrap()
     }
 
     #[test]
@@ -163,6 +261,63 @@ mod tests {
         assert_eq!(back, head());
         assert_eq!(back.content_hash(), head().content_hash());
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no unfinished file is left");
+    }
+
+    fn vlad(words: usize) -> Aggregate {
+        Aggregate::Vlad(VladWords::new((0..words * 4).map(|i| i as f32 / 9.0).collect(), 4).unwrap())
+    }
+
+    #[test]
+    fn the_aggregate_is_part_of_the_file_and_of_the_hash() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("h.safetensors");
+        let mut hashes = std::collections::BTreeSet::new();
+        for aggregate in [Aggregate::Mean, Aggregate::gem(3.0).unwrap(), Aggregate::gem(4.0).unwrap(), vlad(2)] {
+            let (weight, bias) = (head().weight, head().bias);
+            let made = Head::new(aggregate.clone(), weight, bias, "backbone-x", head().notes).unwrap();
+            made.save(&path).unwrap();
+            let back = Head::load(&path).unwrap();
+            assert_eq!((&back, back.aggregate(), back.content_hash()), (&made, &aggregate, made.content_hash()));
+            assert_eq!(back.dim(), aggregate.pooled_dim(back.token_dim()));
+            assert!(hashes.insert(back.content_hash()), "{aggregate} shares its hash with another");
+        }
+        assert!(hashes.contains(&head().content_hash()), "a mean head keeps the hash it always had");
+        let wrong = Head::new(vlad(3), head().weight, head().bias, "x", [].into()).unwrap_err().to_string();
+        assert!(wrong.contains("takes 8 values, its 3 visual words make 12"), "{wrong}");
+    }
+
+    #[test]
+    fn a_file_whose_aggregate_does_not_fit_is_refused() {
+        let refusal = |kind: &str, extra: Option<(&str, Vec<usize>)>| {
+            let (head, values) = (head(), vec![1.5f32; 64]);
+            let view = |shape: Vec<usize>, values: &[f32]| {
+                let bytes = bytemuck::cast_slice::<f32, u8>(&values[..shape.iter().product()]).to_vec();
+                (shape, bytes)
+            };
+            let mut parts = vec![("weight", view(vec![256, 8], &head.weight)), ("bias", view(vec![256], &head.bias))];
+            parts.extend(extra.map(|(name, shape)| (name, view(shape, &values))));
+            let tensors: Vec<_> = parts
+                .iter()
+                .map(|(name, (shape, bytes))| (*name, TensorView::new(Dtype::F32, shape.clone(), bytes).unwrap()))
+                .collect();
+            let meta: HashMap<_, _> =
+                [("backbone".to_owned(), "x".to_owned()), ("aggregate".to_owned(), kind.to_owned())].into();
+            let bytes = safetensors::serialize(tensors, Some(meta)).unwrap();
+            Head::from_bytes(&bytes, Path::new("h")).err().map(|error| error.to_string()).unwrap_or_default()
+        };
+        assert_eq!(refusal("gem", Some((GEM_P, vec![1]))), "");
+        assert_eq!(refusal("vlad", Some((VLAD_WORDS, vec![2, 4]))), "");
+        for (kind, extra, part) in [
+            ("median", None, "\"median\" is not one of"),
+            ("mean", Some((GEM_P, vec![1])), "unexpected tensor gem_p"),
+            ("gem", None, "gem_p is missing"),
+            ("gem", Some((GEM_P, vec![2])), "gem_p is F32 [2], not a float [1]"),
+            ("vlad", Some((VLAD_WORDS, vec![3, 4])), "make 12"),
+            ("vlad", Some((VLAD_WORDS, vec![8])), "not a float [any, any]"),
+        ] {
+            let refusal = refusal(kind, extra);
+            assert!(refusal.contains(part), "{kind}: {refusal}");
+        }
     }
 
     #[test]

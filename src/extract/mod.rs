@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! ImageTensor --encoder--> tokens [n, d], CLS attention [heads, n]
-//!     tokens    --global--> pooled [d] --head--> global [256]
+//!     tokens    --aggregate--> pooled [d] --head--> global [256]
 //!     attention --fusion--> per scale --selection--> key patches, fused from tokens
 //! ```
 //!
@@ -11,7 +11,7 @@
 //! [`CandleEncoder`] is the plain implementation it is tested against.
 
 mod activation;
-pub mod batcher;
+mod aggregate;
 mod config;
 mod encoder;
 mod error;
@@ -20,6 +20,7 @@ mod fused;
 mod fusion;
 mod global;
 mod head;
+mod model_id;
 mod pca;
 mod positions;
 mod preset;
@@ -30,6 +31,7 @@ mod trace;
 mod vit;
 mod weights;
 
+pub use aggregate::{Aggregate, VladWords, sample_tokens};
 pub use config::{ExtractConfig, HeadChoice};
 pub use encoder::{EncodedImage, Encoder, EncoderSpec, Precision, TokenGrid, check_image, token_grid};
 pub use error::ExtractError;
@@ -38,11 +40,12 @@ pub use fused::FusedEncoder;
 pub use fusion::{attention_map, average_pool};
 pub use global::{l2_normalise, mean_token};
 pub use head::Head;
-pub use pca::Covariance;
+pub use pca::{Covariance, half_whitened_head_of_few};
 pub use positions::interpolate as interpolate_positions;
 pub use preset::{Geometry, LAYER_NORM_EPS, Preset};
 pub use record::{Record, verify as verify_weights};
 pub use selection::{key_patches, select};
 pub use trace::{ExtractionTrace, TraceArray, TraceValues};
 pub use vit::CandleEncoder;
+pub(crate) use weights::write_atomically;
 pub use weights::{BlockWeights, Linear, Norm, VitWeights, hash_file};

@@ -18,7 +18,9 @@ pub struct ExtractionTrace {
     pub encoded: EncodedImage,
     /// CLS attention summed over heads, in multiples of the uniform level, `[n]`.
     pub attention: Vec<f32>,
-    /// L2-normalised mean token, `[d]`.
+    /// How the tokens were pooled: `mean`, `gem` or `vlad`.
+    pub pooling: &'static str,
+    /// Pooled tokens, L2-normalised: `[d]`, or `[words * d]` of a VLAD.
     pub pooled: Vec<f32>,
     /// Global descriptor: `[256]`, or `pooled` where there is no head.
     pub global: Vec<f32>,
@@ -85,7 +87,11 @@ impl ExtractionTrace {
             floats(format!("{exit}_rows"), &[1 + n, dim], &tokens),
             floats(format!("cls_attention_{attention}_heads"), &[heads, n], &self.encoded.cls_attention),
             floats("attention_map".into(), &[self.encoded.grid.rows, self.encoded.grid.columns], &self.attention),
-            floats(format!("global_mean_{}_l2", exit.replace("_tokens", "")), &[dim], &self.pooled),
+            floats(
+                format!("global_{}_{}_l2", self.pooling, exit.replace("_tokens", "")),
+                &[self.pooled.len()],
+                &self.pooled,
+            ),
             floats("global".into(), &[self.global.len()], &self.global),
         ];
         for (scale, keys) in (1..).zip(&self.key_patches.scales) {

@@ -417,7 +417,7 @@ pub fn hash_file(path: &Path) -> std::io::Result<String> {
 }
 
 /// Writes `bytes` beside `path`, syncs, and renames into place: a crash leaves the old file or the new one.
-pub(in crate::extract) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ExtractError> {
+pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ExtractError> {
     let part = with_suffix(path, &format!(".{}.part", std::process::id()));
     let written = std::fs::File::create(&part).and_then(|mut file| {
         std::io::Write::write_all(&mut file, bytes)?;

@@ -100,6 +100,8 @@ impl AppState {
         if self.service.set(service).is_err() {
             tracing::error!("the service was opened twice; the first one stays");
         }
+        // Only now: who is told that the server is ready must not be refused by the next request.
+        self.health.serving();
     }
 
     /// The service, if start-up is through.

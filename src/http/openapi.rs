@@ -98,6 +98,8 @@ fn errors_of(path: &str, method: &str) -> Vec<ErrorCode> {
         ("/references", _) => &[&[InvalidParameter, MapNotFound]],
         ("/references/{id}", "patch") => &[&sent, &[ReferenceNotFound, ExternalIdConflict, CorruptRecord, DiskFull]],
         ("/references/{id}", _) => &[&[ReferenceNotFound, CorruptRecord, DiskFull]],
+        ("/maps/{map}/calibration", "put") => &[&sent, &[MapNotFound, CalibrationMismatch, DiskFull]],
+        ("/maps/{map}/calibration", _) => &[&[MapNotFound, DiskFull]],
         ("/maps/{map}", _) => &[&[MapNotFound, DiskFull]],
         _ => &[],
     };

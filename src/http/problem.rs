@@ -91,7 +91,7 @@ impl ApiError {
 
     /// Answers that ask the client to come back say when: as known, else after a second.
     fn retry_after_seconds(&self) -> Option<u64> {
-        let asks = matches!(self.code.status(), 429 | 503 | 507);
+        let asks = matches!(self.code.status(), 429 | 503 | 504 | 507);
         let known = self.retry_after.map(|after| after.as_secs_f64().ceil().max(1.0) as u64);
         known.or(asks.then_some(if self.code == ErrorCode::DiskFull { 30 } else { 1 }))
     }

@@ -24,10 +24,15 @@ pub(super) fn contained<T>(work: impl FnOnce() -> Result<T, ImageError>) -> Resu
     })
 }
 
-/// Checks limits and decodes without turning the image upright.
-pub(super) fn decode_as_stored(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError> {
+/// Checks limits and decodes without turning the image upright. A JPEG far larger than what it is `wanted` for (as
+/// stored) may come out smaller, but never less than twice as large.
+pub(super) fn decode_as_stored(
+    bytes: &[u8],
+    config: &ImageConfig,
+    wanted: Option<ImageSize>,
+) -> Result<RgbImage, ImageError> {
     match header::sniff(bytes, config)? {
-        Format::Jpeg => jpeg(bytes, config),
+        Format::Jpeg => jpeg(bytes, config, wanted),
         Format::Png => {
             header::check_size(Format::Png, header::png_size(bytes)?, config)?;
             let mut limits = Limits::no_limits();
@@ -50,7 +55,7 @@ fn decoded_limit(config: &ImageConfig) -> u64 {
     config.max_pixels.saturating_mul(4)
 }
 
-fn jpeg(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError> {
+fn jpeg(bytes: &[u8], config: &ImageConfig, wanted: Option<ImageSize>) -> Result<RgbImage, ImageError> {
     let fail = |error: DecodeErrors| Format::Jpeg.undecodable(jpeg_reason(&error));
     // The decoder's own limits are opened wide: ours are checked below, on the header, with a better message.
     let options = DecoderOptions::default()
@@ -67,11 +72,39 @@ fn jpeg(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError> {
     if !header::jpeg_is_complete(bytes) {
         return Err(Format::Jpeg.undecodable("truncated: the end-of-image marker is missing"));
     }
+    let simple = matches!(decoder.input_colorspace(), Some(ColorSpace::YCbCr));
+    if let Some(scale) = wanted.and_then(|wanted| reduction(size, wanted)).filter(|_| simple) {
+        return jpeg_reduced(bytes, size, scale);
+    }
     let pixels = decoder.decode().map_err(fail)?;
     match decoder.output_colorspace() {
         Some(ColorSpace::RGB) => Ok(RgbImage { size, pixels }),
         other => Err(Format::Jpeg.undecodable(format!("its colours ({other:?}) cannot be shown as RGB"))),
     }
+}
+
+/// The largest of 1/8, 1/4 and 1/2 that leaves both sides at least twice what is wanted: the antialiased resize that
+/// follows then averages what is left, and the result stays within a level or two of a full decode.
+fn reduction(size: ImageSize, wanted: ImageSize) -> Option<u32> {
+    let leaves_enough =
+        |scale: &u32| size.width / scale >= 2 * wanted.width && size.height / scale >= 2 * wanted.height;
+    [8, 4, 2].into_iter().find(leaves_enough)
+}
+
+/// Decodes at `1 / scale` of the size: fewer coefficients, fewer pixels, the same picture.
+fn jpeg_reduced(bytes: &[u8], size: ImageSize, scale: u32) -> Result<RgbImage, ImageError> {
+    let fail = |error: jpeg_decoder::Error| Format::Jpeg.undecodable(error.to_string());
+    let mut decoder = jpeg_decoder::Decoder::new(bytes);
+    decoder.read_info().map_err(fail)?;
+    // A JPEG's sides are 16-bit numbers.
+    let side = |pixels: u32| pixels.div_ceil(scale) as u16;
+    let (width, height) = decoder.scale(side(size.width), side(size.height)).map_err(fail)?;
+    let pixels = decoder.decode().map_err(fail)?;
+    let reduced = ImageSize { width: u32::from(width), height: u32::from(height) };
+    if pixels.len() as u64 != u64::from(reduced.width) * u64::from(reduced.height) * 3 {
+        return Err(Format::Jpeg.undecodable("its colours cannot be shown as RGB"));
+    }
+    Ok(RgbImage { size: reduced, pixels })
 }
 
 /// The decoder's reason in words for the sender.
@@ -159,6 +192,17 @@ pub(super) fn apply(orientation: Orientation, image: RgbImage) -> RgbImage {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_what_is_far_too_large_is_reduced() {
+        let size = |width, height| ImageSize { width, height };
+        assert_eq!(reduction(size(640, 480), size(448, 336)), None);
+        assert_eq!(reduction(size(1920, 1080), size(448, 336)), None);
+        assert_eq!(reduction(size(1920, 1400), size(448, 336)), Some(2));
+        assert_eq!(reduction(size(4032, 3024), size(448, 336)), Some(4));
+        assert_eq!(reduction(size(8000, 700), size(448, 336)), None, "one side would become too short");
+        assert_eq!(reduction(size(16_000, 12_000), size(448, 336)), Some(8));
+    }
 
     #[test]
     fn a_panic_becomes_an_error_that_quotes_it() {

@@ -18,6 +18,7 @@ mod resize;
 pub use encode::{encode_jpeg, encode_png};
 pub use error::ImageError;
 pub use exif::{ExifInfo, read_exif};
+pub use resize::{DEVIATION, MEAN};
 
 use crate::types::{ImageSize, ImageTensor};
 use serde::{Deserialize, Serialize};
@@ -79,7 +80,7 @@ impl RgbImage {
 /// See [`ImageError`]; a truncated file is refused, not padded with grey.
 pub fn decode(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError> {
     decode::contained(|| {
-        let image = decode::decode_as_stored(bytes, config)?;
+        let image = decode::decode_as_stored(bytes, config, None)?;
         Ok(decode::apply(exif::orientation(bytes), image))
     })
 }
@@ -90,8 +91,8 @@ pub fn decode(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError
 /// See [`ImageError`]; also when `size` has a side of zero pixels.
 pub fn load_tensor(bytes: &[u8], config: &ImageConfig, size: ImageSize) -> Result<ImageTensor, ImageError> {
     decode::contained(|| {
-        let stored = decode::decode_as_stored(bytes, config)?;
         let orientation = exif::orientation(bytes);
+        let stored = decode::decode_as_stored(bytes, config, Some(decode::stored_size(orientation, size)))?;
         let small = resize::resize(&stored, decode::stored_size(orientation, size))?;
         Ok(resize::normalise(&decode::apply(orientation, small)))
     })

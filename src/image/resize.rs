@@ -6,9 +6,9 @@ use fast_image_resize::images::{Image, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
 
 /// ImageNet mean of R, G, B.
-const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
+pub const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 /// ImageNet standard deviation of R, G, B.
-const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
+pub const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
 
 /// Squashes `image` to `size`: bilinear, its support widened by the reduction (Pillow's BILINEAR).
 pub(super) fn resize(image: &RgbImage, size: ImageSize) -> Result<RgbImage, ImageError> {

@@ -2,14 +2,15 @@
 //! those of a group of query rows, which stay in the second-level cache.
 //!
 //! Keys and values lie as the two products read them, cut into chunks of [`chunk_rows`] tokens so that each chunk can be
-//! written by the thread that computed it: keys `[chunk][head][key panel][head_dim][columns]`, values
-//! `[chunk][head][value panel][chunk_rows][columns]`, panels `columns` wide as in [`Tiling`]. A group of queries first
-//! meets every key panel (4 to 8 kB, first-level cache), then softmax runs over its rows, then it meets the values.
-//! Queries carry the factor log2(e) / sqrt(head_dim).
+//! written by the thread that computed it: keys `[chunk][head][key panel][words of head_dim][columns]`, values
+//! `[chunk][head][value panel][words of chunk_rows][columns]`, panels `columns` wide as in [`Tiling`]. A group of queries
+//! first meets every key panel (2 to 8 kB, first-level cache), then softmax runs over its rows, then it meets the
+//! values. Queries carry the factor log2(e) / sqrt(head_dim). Both products are in f32 or bf16, softmax in f32.
 
 use super::Simd;
 use super::elementwise::{exponentiate_row, scale_rows};
-use super::gemm::{Panel, Rows, Tiling, multiply_panel};
+use super::gemm::{Panel, Tiling, multiply_panel};
+use super::operand::{Format, Rows};
 
 /// Tokens of a chunk: whole register tiles and whole key panels.
 pub fn chunk_rows(simd: Simd) -> usize {
@@ -29,6 +30,8 @@ const GROUP_SCORES: usize = 40 * 1024;
 /// How the tokens of an image and their heads are laid out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AttentionShape {
+    /// Format of both products: f32 or bf16.
+    pub format: Format,
     /// Tokens of an image, CLS included.
     pub tokens: usize,
     /// Heads.
@@ -45,13 +48,22 @@ impl AttentionShape {
         self.tokens.div_ceil(self.chunk_rows)
     }
 
-    /// Floats of one chunk's keys, or of its values: all heads.
+    /// Words of one chunk's keys, or of its values: all heads.
     pub fn chunk_len(&self) -> usize {
         self.heads * self.head_len()
     }
 
+    /// Words of one token's queries: all heads.
+    pub fn query_len(&self) -> usize {
+        self.heads * self.head_words()
+    }
+
+    fn head_words(&self) -> usize {
+        self.format.words(self.head_dim)
+    }
+
     fn head_len(&self) -> usize {
-        self.head_dim * self.chunk_rows
+        self.head_words() * self.chunk_rows
     }
 
     fn padded_tokens(&self) -> usize {
@@ -69,32 +81,53 @@ impl AttentionShape {
     }
 }
 
-/// Writes a finished `[rows, columns]` block of the key projection, `columns` dimensions of one head from `dim` on, to
-/// its places in a chunk's keys.
+/// Writes finished rows of the query projection, `columns` dimensions of one head from `dim` on and in the shape's
+/// format, to their places in `queries` (`[rows, query_len]`).
+///
+/// # Panics
+/// If `queries` is too short.
+pub fn store_queries(shape: &AttentionShape, head: usize, dim: usize, block: Rows<'_>, queries: &mut [u32]) {
+    let at = head * shape.head_words() + shape.format.words(dim);
+    for (row, words) in block.data.chunks_exact(block.stride).enumerate() {
+        queries[row * shape.query_len() + at..][..words.len()].copy_from_slice(words);
+    }
+}
+
+/// As [`store_queries`], to a chunk's keys.
 ///
 /// # Panics
 /// If `keys` is not a chunk of `shape`.
-pub fn store_keys(simd: Simd, shape: &AttentionShape, head: usize, dim: usize, block: &[f32], keys: &mut [f32]) {
-    let columns = Tiling::of(simd).columns;
+pub fn store_keys(simd: Simd, shape: &AttentionShape, head: usize, dim: usize, block: Rows<'_>, keys: &mut [u32]) {
+    let (columns, panel_len) = (Tiling::of(simd).columns, shape.head_words() * Tiling::of(simd).columns);
     assert_eq!(keys.len(), shape.chunk_len(), "not one chunk of keys");
     let head = &mut keys[head * shape.head_len()..][..shape.head_len()];
-    for (token, row) in block.chunks_exact(columns).enumerate() {
-        let panel = &mut head[token / columns * shape.head_dim * columns..][..shape.head_dim * columns];
-        for (offset, &value) in row.iter().enumerate() {
-            panel[(dim + offset) * columns + token % columns] = value;
+    for (token, row) in block.data.chunks_exact(block.stride).enumerate() {
+        let panel = &mut head[token / columns * panel_len..][..panel_len];
+        for (offset, &word) in row.iter().enumerate() {
+            panel[(shape.format.words(dim) + offset) * columns + token % columns] = word;
         }
     }
 }
 
-/// As [`store_keys`], for values.
+/// As [`store_keys`], for values: their words hold the same dimension of neighbouring tokens.
 ///
 /// # Panics
 /// If `values` is not a chunk of `shape`.
-pub fn store_values(simd: Simd, shape: &AttentionShape, head: usize, dim: usize, block: &[f32], values: &mut [f32]) {
+pub fn store_values(simd: Simd, shape: &AttentionShape, head: usize, dim: usize, block: Rows<'_>, values: &mut [u32]) {
     let columns = Tiling::of(simd).columns;
     assert_eq!(values.len(), shape.chunk_len(), "not one chunk of values");
-    let panel = head * shape.head_len() + dim / columns * shape.chunk_rows * columns;
-    values[panel..panel + block.len()].copy_from_slice(block);
+    let panel = head * shape.head_len() + dim / columns * shape.format.words(shape.chunk_rows) * columns;
+    let panel = &mut values[panel..];
+    if shape.format == Format::F32 {
+        return panel[..block.data.len()].copy_from_slice(block.data);
+    }
+    for (pair, out) in block.data.chunks_exact(2 * block.stride).zip(panel.chunks_exact_mut(columns)) {
+        let (first, second) = pair.split_at(block.stride);
+        for ((out, first), second) in out.chunks_exact_mut(2).zip(first).zip(second) {
+            out[0] = first & 0xffff | second << 16;
+            out[1] = first >> 16 | second & 0xffff_0000;
+        }
+    }
 }
 
 /// Scores of `rows` query rows of one head over every key, `[rows, padded tokens]`; places beyond the last token hold
@@ -105,20 +138,26 @@ fn score(
     head: usize,
     queries: Rows<'_>,
     rows: usize,
-    keys: &[f32],
+    keys: &[u32],
     out: &mut [f32],
 ) {
     let columns = Tiling::of(simd).columns;
-    let (panel_len, per_chunk) = (shape.head_dim * columns, shape.chunk_rows / columns);
+    let (panel_len, per_chunk) = (shape.head_words() * columns, shape.chunk_rows / columns);
     for panel in 0..shape.tokens.div_ceil(columns) {
         let at = panel / per_chunk * shape.chunk_len() + head * shape.head_len() + panel % per_chunk * panel_len;
-        let right = Panel::whole(&keys[at..at + panel_len], shape.head_dim);
-        multiply_panel(simd, rows, queries, right, &mut out[panel * columns..], shape.padded_tokens(), false);
+        let right = Panel::whole(&keys[at..at + panel_len], shape.head_words());
+        let out = &mut out[panel * columns..];
+        multiply_panel(simd, shape.format, rows, queries, right, out, shape.padded_tokens());
     }
 }
 
-/// Attention of `rows` query rows (whole register tiles) of one head. `queries` and `out` are `[rows, ..]` with row `i`
-/// at `i * stride` and this head's dimensions first; `keys` and `values` are all chunks of the image.
+/// The query rows of one head, `[rows, query_len]` from `first` on.
+fn head_queries<'a>(shape: &AttentionShape, head: usize, first: usize, queries: &'a [u32]) -> Rows<'a> {
+    Rows { data: &queries[first * shape.query_len() + head * shape.head_words()..], stride: shape.query_len() }
+}
+
+/// Attention of `rows` query rows (whole register tiles, `[rows, query_len]`) of one head. `out` is `[rows, ..]` with
+/// row `i` at `i * out_stride` and this head's dimensions first; `keys` and `values` are all chunks of the image.
 ///
 /// # Panics
 /// If a slice is shorter than `shape` says.
@@ -127,34 +166,34 @@ pub fn attend(
     simd: Simd,
     shape: &AttentionShape,
     head: usize,
-    queries: Rows<'_>,
-    rows: usize,
-    (keys, values): (&[f32], &[f32]),
+    (queries, rows): (&[u32], usize),
+    (keys, values): (&[u32], &[u32]),
     scratch: &mut [f32],
     out: &mut [f32],
+    out_stride: usize,
 ) {
     let columns = Tiling::of(simd).columns;
     let (width, group) = (shape.padded_tokens(), shape.group_rows(simd));
     let mut reciprocals = [0.0f32; 128];
     for first in (0..rows).step_by(group) {
         let count = group.min(rows - first);
-        let group_queries = Rows { data: &queries.data[first * queries.stride..], stride: queries.stride };
-        score(simd, shape, head, group_queries, count, keys, scratch);
+        score(simd, shape, head, head_queries(shape, head, first, queries), count, keys, scratch);
         for (row, reciprocal) in scratch.chunks_exact_mut(width).zip(&mut reciprocals[..count]) {
-            *reciprocal = exponentiate_row(simd, &mut row[..shape.tokens]);
+            *reciprocal = exponentiate_row(simd, shape.format, &mut row[..shape.tokens]);
         }
-        let out = &mut out[first * queries.stride..];
+        let out = &mut out[first * out_stride..];
         for dim in (0..shape.head_dim).step_by(columns) {
+            let segment_rows = shape.format.words(shape.chunk_rows);
             let panel = Panel {
-                data: &values[head * shape.head_len() + dim * shape.chunk_rows..],
-                k: shape.tokens,
-                segment_rows: shape.chunk_rows,
+                data: &values[head * shape.head_len() + dim * segment_rows..],
+                k: shape.format.words(shape.tokens),
+                segment_rows,
                 segment_stride: shape.chunk_len(),
             };
-            let weights = Rows { data: scratch, stride: width };
-            multiply_panel(simd, count, weights, panel, &mut out[dim..], queries.stride, false);
+            let weights = Rows::f32(scratch, width);
+            multiply_panel(simd, shape.format, count, weights, panel, &mut out[dim..], out_stride);
         }
-        scale_rows(&reciprocals[..count], shape.head_dim, out, queries.stride);
+        scale_rows(&reciprocals[..count], shape.head_dim, out, out_stride);
     }
 }
 
@@ -166,55 +205,88 @@ pub fn first_row_attention(
     simd: Simd,
     shape: &AttentionShape,
     head: usize,
-    queries: Rows<'_>,
-    keys: &[f32],
+    queries: &[u32],
+    keys: &[u32],
     scratch: &mut [f32],
     out: &mut [f32],
 ) {
-    score(simd, shape, head, queries, Tiling::of(simd).rows, keys, scratch);
+    score(simd, shape, head, head_queries(shape, head, 0, queries), Tiling::of(simd).rows, keys, scratch);
     out.copy_from_slice(&scratch[..shape.tokens]);
-    let reciprocal = exponentiate_row(simd, out);
+    let reciprocal = exponentiate_row(simd, Format::F32, out);
     scale_rows(&[reciprocal], shape.tokens, out, shape.tokens);
 }
 
 /// Blocked attention against the definition in f64, on a token count that fills no panel.
 pub(super) fn check(simd: Simd) -> Result<(), String> {
-    (1..4).try_for_each(|extra| compare_with_definition(simd, chunk_rows(simd) + 10 * extra + 1, 2, 32))
+    for format in [Format::F32, Format::Bf16].into_iter().filter(|format| format.is_available(simd)) {
+        for extra in 1..4 {
+            compare_with_definition(simd, format, chunk_rows(simd) + 10 * extra + 1, 2, 32)?;
+        }
+    }
+    Ok(())
 }
 
-fn compare_with_definition(simd: Simd, tokens: usize, heads: usize, head_dim: usize) -> Result<(), String> {
-    use super::testing::{differ, ramp};
-    let columns = Tiling::of(simd).columns;
-    let shape = AttentionShape { tokens, heads, head_dim, chunk_rows: chunk_rows(simd) };
-    let (dim, padded) = (heads * head_dim, shape.padded_tokens());
-    let [queries, key_rows, value_rows] = [11, 12, 13].map(|seed| ramp(padded * dim, seed));
-    let (mut keys, mut values) = (vec![f32::NAN; shape.chunks() * shape.chunk_len()], Vec::new());
-    values.resize(keys.len(), f32::NAN);
+/// Queries, keys and values `[tokens, dim]` of one image, laid out as the encoder does.
+fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, Vec<u32>, Vec<u32>) {
+    use super::operand::OperandBuffer;
+    let (columns, dim) = (Tiling::of(simd).columns, shape.heads * shape.head_dim);
+    let nothing = f32::NAN.to_bits();
+    let mut queries = vec![nothing; shape.padded_tokens() * shape.query_len()];
+    let (mut keys, mut values) = (vec![nothing; shape.chunks() * shape.chunk_len()], Vec::new());
+    values.resize(keys.len(), nothing);
     for chunk in 0..shape.chunks() {
         let places = chunk * shape.chunk_len()..(chunk + 1) * shape.chunk_len();
-        let filled = (tokens - chunk * shape.chunk_rows).min(shape.chunk_rows);
+        // Whole tiles are written, as the encoder does: beyond the last token there are finite numbers.
+        let filled = (shape.tokens - chunk * shape.chunk_rows).min(shape.chunk_rows);
+        let filled = filled.next_multiple_of(Tiling::of(simd).rows);
         for column in (0..dim).step_by(columns) {
+            let (head, within) = (column / shape.head_dim, column % shape.head_dim);
             let block = |rows: &[f32]| -> Vec<f32> {
                 let row = |token: usize| &rows[(chunk * shape.chunk_rows + token) * dim + column..][..columns];
                 (0..filled).flat_map(|token| row(token).iter().copied()).collect()
             };
-            let (head, within) = (column / head_dim, column % head_dim);
-            store_keys(simd, &shape, head, within, &block(&key_rows), &mut keys[places.clone()]);
-            store_values(simd, &shape, head, within, &block(&value_rows), &mut values[places.clone()]);
+            let blocks = rows.map(block);
+            let mut buffers = [(); 3].map(|()| OperandBuffer::default());
+            let mut words = buffers
+                .iter_mut()
+                .zip(&blocks)
+                .map(|(buffer, block)| buffer.pack(simd, shape.format, filled, columns, (block, columns)).rows);
+            let mut next = || words.next().unwrap_or(Rows { data: &[], stride: 1 });
+            let (query, key, value) = (next(), next(), next());
+            let first = chunk * shape.chunk_rows * shape.query_len();
+            store_queries(shape, head, within, query, &mut queries[first..]);
+            store_keys(simd, shape, head, within, key, &mut keys[places.clone()]);
+            store_values(simd, shape, head, within, value, &mut values[places.clone()]);
         }
     }
+    (queries, keys, values)
+}
+
+fn compare_with_definition(
+    simd: Simd,
+    format: Format,
+    tokens: usize,
+    heads: usize,
+    head_dim: usize,
+) -> Result<(), String> {
+    use super::testing::{differ, ramp};
+    let shape = AttentionShape { format, tokens, heads, head_dim, chunk_rows: chunk_rows(simd) };
+    let (dim, padded) = (heads * head_dim, shape.padded_tokens());
+    let [query_rows, key_rows, value_rows] = [11, 12, 13].map(|seed| ramp(padded * dim, seed));
+    let (queries, keys, values) = lay_out(simd, &shape, [&query_rows, &key_rows, &value_rows]);
+    // bf16 keeps eight bits: of the scores, then of the weights.
+    let (of_values, of_weights) = if format == Format::F32 { (1e-5, 1e-5) } else { (2e-2, 5e-3) };
     let rows = Tiling::of(simd).rows * 3;
     let (mut scratch, mut out) = (vec![f32::NAN; shape.scratch_len(simd)], vec![0.0; rows * dim]);
     let mut first = vec![0.0; tokens];
     for head in 0..heads {
         let at = head * head_dim;
-        let left = Rows { data: &queries[at..], stride: dim };
-        first_row_attention(simd, &shape, head, left, &keys, &mut scratch, &mut first);
-        attend(simd, &shape, head, left, rows, (&keys, &values), &mut scratch, &mut out[at..]);
+        first_row_attention(simd, &shape, head, &queries, &keys, &mut scratch, &mut first);
+        attend(simd, &shape, head, (&queries, rows), (&keys, &values), &mut scratch, &mut out[at..], dim);
         for row in 0..rows {
             let dot = |token: usize| -> f64 {
                 (0..head_dim)
-                    .map(|i| f64::from(queries[row * dim + at + i]) * f64::from(key_rows[token * dim + at + i]))
+                    .map(|i| f64::from(query_rows[row * dim + at + i]) * f64::from(key_rows[token * dim + at + i]))
                     .sum()
             };
             let weights: Vec<f64> = (0..tokens).map(|token| dot(token).exp2()).collect();
@@ -222,12 +294,13 @@ fn compare_with_definition(simd: Simd, tokens: usize, heads: usize, head_dim: us
             for i in 0..head_dim {
                 let mix = |token: usize| weights[token] / total * f64::from(value_rows[token * dim + at + i]);
                 let (actual, expected) = (out[row * dim + at + i], (0..tokens).map(mix).sum());
-                if differ(actual, expected, 1e-5) {
-                    return Err(format!("{tokens} tokens, head {head}, row {row}: {actual} is not {expected}"));
+                if differ(actual, expected, of_values) {
+                    return Err(format!("{format:?}, {tokens} tokens, row {row}: {actual} is not {expected}"));
                 }
             }
-            if let Some(token) = (0..tokens).find(|&t| row == 0 && differ(first[t], weights[t] / total, 1e-5)) {
-                return Err(format!("{tokens} tokens, head {head}: weight {token} of the first row is off"));
+            let off = |t: &usize| row == 0 && differ(first[*t], weights[*t] / total, of_weights);
+            if let Some(token) = (0..tokens).find(off) {
+                return Err(format!("{format:?}, {tokens} tokens: weight {token} of the first row is off"));
             }
         }
     }
@@ -242,9 +315,11 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(24))]
         #[test]
-        fn equals_the_definition(tokens in 1usize..180, heads in 1usize..3) {
+        fn equals_the_definition(tokens in 36usize..180, heads in 1usize..3) {
             for simd in Simd::all() {
-                prop_assert_eq!(compare_with_definition(simd, tokens, heads, 32), Ok(()));
+                for format in [Format::F32, Format::Bf16].into_iter().filter(|format| format.is_available(simd)) {
+                    prop_assert_eq!(compare_with_definition(simd, format, tokens, heads, 32), Ok(()));
+                }
             }
         }
     }

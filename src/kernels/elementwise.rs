@@ -5,10 +5,12 @@
 //! 3.7, of degree 13 in x^2 mapped to [-1, 1], 1 beyond (absolute error 4e-7). Both were fitted for the smallest
 //! maximal error.
 
+use super::Simd;
+use super::gemm::{PanelCodes, Tiling};
 #[cfg(target_arch = "x86_64")]
 use super::lanes::{Avx2, Avx512};
-use super::lanes::{Lanes, Portable, ROUNDING, at_level};
-use super::{Simd, gemm::Tiling};
+use super::lanes::{Lanes, Portable, ROUNDING, at_bf16_level, at_level};
+use super::operand::Format;
 
 /// What is done with a finished block of a matrix product.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,39 +23,41 @@ pub enum Epilogue {
     BiasResidual,
 }
 
-/// Applies `epilogue` to a dense `[rows, columns]` block, `columns` as in [`Tiling`]; row `i` of `out` starts at
-/// `i * out_stride`.
+/// A finished block of a matrix product, `[rows, columns]` with `columns` as in [`Tiling`].
+#[derive(Debug, Clone, Copy)]
+pub struct Product<'a> {
+    /// Rows.
+    pub rows: usize,
+    /// The sums: floats, or bits of i32 where `codes` is there.
+    pub block: &'a [f32],
+    /// What turns integer sums into numbers.
+    pub codes: Option<PanelCodes<'a>>,
+    /// What a code of each row is worth; read only where `codes` is there.
+    pub factors: &'a [f32],
+    /// Added to each column, if any.
+    pub bias: Option<&'a [f32]>,
+}
+
+/// Applies `epilogue` to a product; row `i` of `out` starts at `i * out_stride`.
 ///
 /// # Panics
 /// If a slice is too short.
-pub fn finish_block(
-    simd: Simd,
-    epilogue: Epilogue,
-    rows: usize,
-    block: &[f32],
-    bias: &[f32],
-    out: &mut [f32],
-    out_stride: usize,
-) {
-    let columns = Tiling::of(simd).columns;
+pub fn finish_block(simd: Simd, epilogue: Epilogue, product: Product<'_>, out: &mut [f32], out_stride: usize) {
+    let (columns, rows) = (Tiling::of(simd).columns, product.rows);
     if rows == 0 {
         return;
     }
-    assert!(block.len() >= rows * columns, "block too short");
-    assert!(bias.len() >= columns, "bias too short");
+    assert!(product.block.len() >= rows * columns, "block too short");
+    assert!(product.bias.is_none_or(|bias| bias.len() >= columns), "bias too short");
     assert!(out.len() >= (rows - 1) * out_stride + columns, "result too short");
-    let job = FinishJob {
-        epilogue,
-        rows,
-        columns,
-        block: block.as_ptr(),
-        bias: bias.as_ptr(),
-        out: out.as_mut_ptr(),
-        out_stride,
-    };
+    if let Some(codes) = product.codes {
+        assert!(product.factors.len() >= rows, "factors of the rows too short");
+        assert!(codes.factors.len() >= columns && codes.offsets.len() >= columns, "factors of the columns too short");
+    }
+    let job = FinishJob { epilogue, columns, product, out: out.as_mut_ptr(), out_stride };
     at_level!(
         simd,
-        (job: &FinishJob = &job),
+        (job: &FinishJob<'_> = &job),
         job.run::<Portable>(),
         job.run::<Avx2>(),
         job.run::<Avx512>(),
@@ -61,17 +65,15 @@ pub fn finish_block(
 }
 
 /// The checked arguments of [`finish_block`].
-struct FinishJob {
+struct FinishJob<'a> {
     epilogue: Epilogue,
-    rows: usize,
     columns: usize,
-    block: *const f32,
-    bias: *const f32,
+    product: Product<'a>,
     out: *mut f32,
     out_stride: usize,
 }
 
-impl FinishJob {
+impl FinishJob<'_> {
     #[inline(always)]
     unsafe fn run<V: Lanes>(&self) {
         // SAFETY: `finish_block` has checked the extents; `columns` is a multiple of every vector's length.
@@ -86,13 +88,25 @@ impl FinishJob {
 
     #[inline(always)]
     unsafe fn each<V: Lanes>(&self, finish: impl Fn(V, *const f32) -> V) {
-        for row in 0..self.rows {
-            for column in (0..self.columns).step_by(V::COUNT) {
-                // SAFETY: as in `run`.
-                unsafe {
+        let Product { rows, block, codes, factors, bias } = self.product;
+        for column in (0..self.columns).step_by(V::COUNT) {
+            // SAFETY: as in `run`; offsets are 32 bits wide like floats.
+            unsafe {
+                let bias = bias.map_or(V::splat(0.0), |bias| V::load(bias.as_ptr().add(column)));
+                let codes = codes.map(|codes| {
+                    (V::load(codes.factors.as_ptr().add(column)), V::load(codes.offsets.as_ptr().add(column).cast()))
+                });
+                for row in 0..rows {
                     let out = self.out.add(row * self.out_stride + column);
-                    let value = V::load(self.block.add(row * self.columns + column));
-                    finish(value.add(V::load(self.bias.add(column))), out).store(out);
+                    let sum = V::load(block.as_ptr().add(row * self.columns + column));
+                    let value = match codes {
+                        None => sum.add(bias),
+                        Some((factor, offset)) => {
+                            let factor = factor.mul(V::broadcast(factors.as_ptr().add(row)));
+                            sum.integer_difference(offset).mul_add(factor, bias)
+                        }
+                    };
+                    finish(value, out).store(out);
                 }
             }
         }
@@ -167,20 +181,35 @@ unsafe fn map<V: Lanes>(row: &[f32], out: &mut [f32], apply: impl Fn(V) -> V) {
 }
 
 /// Replaces a row of scores, already multiplied by log2(e), by `2^(score - maximum)` and gives the reciprocal of their
-/// sum: softmax but for one multiplication, which costs less after the next product.
-pub fn exponentiate_row(simd: Simd, scores: &mut [f32]) -> f32 {
-    at_level!(
-        simd,
-        (scores: &mut [f32] = scores) -> f32,
-        exponentiate::<Portable>(scores),
-        exponentiate::<Avx2>(scores),
-        exponentiate::<Avx512>(scores),
-    )
+/// sum: softmax but for one multiplication, which costs less after the next product. In bf16 the results take the first
+/// half of the row, two to a word, a lone last one beside a zero.
+///
+/// # Panics
+/// If the format is int8, or not available at this level.
+pub fn exponentiate_row(simd: Simd, format: Format, scores: &mut [f32]) -> f32 {
+    match format {
+        Format::F32 => at_level!(
+            simd,
+            (scores: &mut [f32] = scores) -> f32,
+            exponentiate::<Portable, false>(scores),
+            exponentiate::<Avx2, false>(scores),
+            exponentiate::<Avx512, false>(scores),
+        ),
+        Format::Bf16 => at_bf16_level!(
+            simd,
+            (scores: &mut [f32] = scores) -> f32,
+            exponentiate::<Portable, true>(scores),
+            exponentiate::<Avx2, true>(scores),
+            exponentiate::<Avx512, true>(scores),
+        ),
+        Format::Int8 => panic!("weights of attention are f32 or bf16"),
+    }
 }
 
 #[inline(always)]
-unsafe fn exponentiate<V: Lanes>(scores: &mut [f32]) -> f32 {
-    // SAFETY: whole vectors stay inside `scores`, the rest is loaded and stored partially.
+unsafe fn exponentiate<V: Lanes, const BF16: bool>(scores: &mut [f32]) -> f32 {
+    // SAFETY: whole vectors stay inside `scores`, the rest is loaded partially and stored by element or, in bf16, in
+    // half its room. Results never lie beyond the scores read so far.
     unsafe {
         let (start, len) = (scores.as_mut_ptr(), scores.len());
         let (pairs, whole) = (len / (2 * V::COUNT) * (2 * V::COUNT), len / V::COUNT * V::COUNT);
@@ -194,27 +223,35 @@ unsafe fn exponentiate<V: Lanes>(scores: &mut [f32]) -> f32 {
             highest[0] = highest[0].max(rest);
         }
         let highest = V::splat(highest[0].max(highest[1]).maximum());
+        let store = |value: V, at: usize| {
+            if BF16 { value.store_bf16(start.cast::<u32>().add(at / 2)) } else { value.store(start.add(at)) }
+        };
         let mut sums = [V::splat(0.0); 2];
         for at in (0..pairs).step_by(2 * V::COUNT) {
             for (half, sum) in sums.iter_mut().enumerate() {
-                let place = start.add(at + half * V::COUNT);
-                let value = exp2(V::load(place).sub(highest));
-                value.store(place);
+                let at = at + half * V::COUNT;
+                let value = exp2(V::load(start.add(at)).sub(highest));
+                store(value, at);
                 *sum = sum.add(value);
             }
         }
         if pairs < whole {
             let value = exp2(V::load(start.add(pairs)).sub(highest));
-            value.store(start.add(pairs));
+            store(value, pairs);
             sums[0] = sums[0].add(value);
         }
         let mut total = sums[0].add(sums[1]).sum();
         if whole < len {
-            let mut rest = [0.0f32; 16];
-            exp2(V::load_partial(start.add(whole), len - whole, 0.0).sub(highest)).store(rest.as_mut_ptr());
-            for (offset, value) in rest[..len - whole].iter().enumerate() {
-                *start.add(whole + offset) = *value;
-                total += value;
+            let (mut rest, count) = ([0.0f32; 16], len - whole);
+            exp2(V::load_partial(start.add(whole), count, 0.0).sub(highest)).store(rest.as_mut_ptr());
+            rest[count..].fill(0.0);
+            total += rest[..count].iter().sum::<f32>();
+            if BF16 {
+                let mut words = [0u32; 8];
+                V::load(rest.as_ptr()).store_bf16(words.as_mut_ptr());
+                std::ptr::copy_nonoverlapping(words.as_ptr(), start.cast::<u32>().add(whole / 2), count.div_ceil(2));
+            } else {
+                std::ptr::copy_nonoverlapping(rest.as_ptr(), start.add(whole), count);
             }
         }
         1.0 / total
@@ -309,7 +346,7 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
         let mean = row.iter().map(|&x| f64::from(x)).sum::<f64>() / len as f64;
         let variance = row.iter().map(|&x| (f64::from(x) - mean).powi(2)).sum::<f64>() / len as f64;
         let mut scores = row.clone();
-        let reciprocal = exponentiate_row(simd, &mut scores);
+        let reciprocal = exponentiate_row(simd, Format::F32, &mut scores);
         let highest = row.iter().copied().fold(f32::MIN, f32::max);
         let total: f64 = row.iter().map(|&x| f64::from(x - highest).exp2()).sum();
         for (index, &x) in row.iter().enumerate() {
@@ -333,7 +370,7 @@ fn check_epilogues(simd: Simd) -> Result<(), String> {
     let (bias, before) = (ramp(columns, 7), ramp(rows * (columns + 3), 8));
     for epilogue in [Epilogue::Bias, Epilogue::BiasGelu, Epilogue::BiasResidual] {
         let mut out = before.clone();
-        finish_block(simd, epilogue, rows, &block, &bias, &mut out, columns + 3);
+        finish_block(simd, epilogue, plain(rows, &block, &bias), &mut out, columns + 3);
         for (index, &actual) in out.iter().enumerate() {
             let (row, column) = (index / (columns + 3), index % (columns + 3));
             let expected = if column >= columns {
@@ -352,6 +389,10 @@ fn check_epilogues(simd: Simd) -> Result<(), String> {
         }
     }
     Ok(())
+}
+
+fn plain<'a>(rows: usize, block: &'a [f32], bias: &'a [f32]) -> Product<'a> {
+    Product { rows, block, codes: None, factors: &[], bias: Some(bias) }
 }
 
 /// erf by its Maclaurin series, whose terms f64 can hold up to about 5.
@@ -381,7 +422,7 @@ mod tests {
             let worst = (1..4000).step_by(columns).fold(0.0f64, |worst, start| {
                 let block: Vec<f32> = (start..start + columns).map(|i| (i as f32 - 2000.0) / 300.0 + 0.001).collect();
                 let mut out = vec![0.0; columns];
-                finish_block(simd, Epilogue::BiasGelu, 1, &block, &vec![0.0; columns], &mut out, columns);
+                finish_block(simd, Epilogue::BiasGelu, plain(1, &block, &vec![0.0; columns]), &mut out, columns);
                 let error = |(&x, &y): (&f32, &f32)| {
                     let x = f64::from(x);
                     (2.0 * f64::from(y) / x - 1.0 - reference_erf(x / std::f64::consts::SQRT_2)).abs()
@@ -399,15 +440,36 @@ mod tests {
             let mut block = vec![0.0; columns];
             (block[0], block[1], block[2]) = (f32::NAN, 1e30, -1e30);
             let mut out = vec![0.0; columns];
-            finish_block(simd, Epilogue::BiasGelu, 1, &block, &vec![0.0; columns], &mut out, columns);
+            finish_block(simd, Epilogue::BiasGelu, plain(1, &block, &vec![0.0; columns]), &mut out, columns);
             assert!(out[0].is_nan(), "{}", out[0]);
             assert!((out[1] / 1e30 - 1.0).abs() < 1e-6 && (out[2] / 1e30).abs() < 1e-6, "{:?}", &out[1..3]);
             let mut scores = vec![1.0; 19];
             scores[3] = f32::NAN;
-            let reciprocal = exponentiate_row(simd, &mut scores);
+            let reciprocal = exponentiate_row(simd, Format::F32, &mut scores);
             assert!(reciprocal.is_nan());
             let mut scores = vec![-3e38, 0.0, -200.0];
-            assert!((exponentiate_row(simd, &mut scores) - 1.0).abs() < 1e-6);
+            assert!((exponentiate_row(simd, Format::F32, &mut scores) - 1.0).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn bf16_weights_are_the_f32_ones_rounded() {
+        for simd in Simd::all().filter(|&simd| Format::Bf16.is_available(simd)) {
+            for len in [1, 2, 15, 16, 17, 33, 769] {
+                let row: Vec<f32> = ramp(len, 9).iter().map(|value| value * 8.0).collect();
+                let (mut exact, mut rounded) = (row.clone(), row);
+                let sums = [Format::F32, Format::Bf16].map(|format| {
+                    let scores = if format == Format::F32 { &mut exact } else { &mut rounded };
+                    exponentiate_row(simd, format, scores)
+                });
+                assert_eq!(sums[0], sums[1]);
+                let words: &[u32] = bytemuck::cast_slice(&rounded);
+                for (at, value) in exact.iter().enumerate() {
+                    let bits = words[at / 2] >> (16 * (at % 2)) & 0xffff;
+                    assert_eq!(bits, u32::from(half::bf16::from_f32(*value).to_bits()), "{at} of {len}");
+                }
+                assert!(len % 2 == 0 || words[len / 2] >> 16 == 0, "the lone last weight of {len} has a neighbour");
+            }
         }
     }
 
@@ -418,7 +480,7 @@ mod tests {
             let run = |simd| {
                 let (mut normed, mut scores) = (vec![0.0; len], row.clone());
                 normalize_rows(simd, len, 1e-6, &row, &mut normed);
-                let reciprocal = exponentiate_row(simd, &mut scores);
+                let reciprocal = exponentiate_row(simd, Format::F32, &mut scores);
                 scale_rows(&[reciprocal], len, &mut scores, len);
                 (normed, scores)
             };

@@ -1,10 +1,10 @@
 //! Matrix products with the right-hand side packed once: the linear layers of the transformer, and the two products
-//! of attention.
+//! of attention, in any [`Format`].
 //!
-//! The right-hand side lies in panels of [`Tiling::columns`] columns, `[panel][k][columns]`, so that a register tile of
-//! [`Tiling::rows`] x `columns` sums reads it in order. The left-hand side stays row-major. One call multiplies a whole
-//! block of rows with one panel, which thereby stays in the first-level cache, and leaves a small dense block that the
-//! caller's epilogue reads while it is hot.
+//! The right-hand side lies in panels of [`Tiling::columns`] columns, `[panel][k in words][columns]`, so that a register
+//! tile of [`Tiling::rows`] x `columns` sums reads it in order. The left-hand side stays row-major. One call multiplies a
+//! whole block of rows with one panel, which thereby stays in the first-level cache, and leaves a small dense block that
+//! the caller's epilogue reads while it is hot.
 //!
 //! Every sum runs over k in ascending order whatever the number of rows or threads, so a row's result depends on
 //! nothing but that row.
@@ -12,8 +12,12 @@
 use super::Simd;
 use super::aligned::AlignedBuffer;
 #[cfg(target_arch = "x86_64")]
+use super::dot::{Avx512Bf16, Avx512Int8};
+use super::dot::{Dot, PortableBf16, PortableInt8};
+#[cfg(target_arch = "x86_64")]
 use super::lanes::{Avx2, Avx512};
-use super::lanes::{Lanes, Portable, at_level};
+use super::lanes::{Portable, at_bf16_level, at_level};
+use super::operand::{Format, Rows};
 use super::simd::SimdLevel;
 
 /// Sums held in registers at once.
@@ -31,32 +35,96 @@ impl Tiling {
         match simd.level() {
             SimdLevel::Scalar => Self { rows: 4, columns: 8 },
             SimdLevel::Avx2 => Self { rows: 6, columns: 16 },
-            SimdLevel::Avx512 => Self { rows: 8, columns: 32 },
+            SimdLevel::Avx512 => Self { rows: 12, columns: 32 },
         }
     }
+}
+
+/// What turns a panel's integer sums into numbers.
+#[derive(Debug, Clone, Copy)]
+pub struct PanelCodes<'a> {
+    /// What a code of each column is worth.
+    pub factors: &'a [f32],
+    /// What the left-hand side's offset of 128 adds to the sum of each column.
+    pub offsets: &'a [i32],
 }
 
 /// A `[k, n]` matrix in panels; columns beyond n are zero.
 #[derive(Debug, Clone)]
 pub struct PackedMatrix {
-    data: AlignedBuffer<f32>,
+    format: Format,
+    data: AlignedBuffer<u32>,
     k: usize,
     n: usize,
     columns: usize,
+    /// Rows of k that are multiplied at a time.
+    slice: usize,
+    /// Of each column; empty unless the format is int8.
+    factors: Vec<f32>,
+    /// `[slices][columns]`, likewise.
+    offsets: Vec<i32>,
 }
 
 impl PackedMatrix {
-    /// Packs the matrix whose element in row `k` and column `n` is `element(k, n)`.
-    pub fn pack(simd: Simd, k: usize, n: usize, element: impl Fn(usize, usize) -> f32) -> Self {
-        let columns = Tiling::of(simd).columns;
-        let mut data = AlignedBuffer::zeroed(n.div_ceil(columns) * k * columns);
+    /// Packs the matrix whose element in row `k` and column `n` is `element(k, n)`, to be multiplied by `slice` rows at
+    /// a time (k for all).
+    ///
+    /// # Panics
+    /// If slices are not whole words.
+    pub fn pack(
+        simd: Simd,
+        format: Format,
+        (k, n): (usize, usize),
+        slice: usize,
+        element: impl Fn(usize, usize) -> f32,
+    ) -> Self {
+        assert!(slice >= k || slice.is_multiple_of(format.per_word()), "slices must be whole words");
+        let (columns, words) = (Tiling::of(simd).columns, format.words(k));
+        let (padded, slices) = (n.next_multiple_of(columns), k.div_ceil(slice.max(1)));
+        let mut packed = Self {
+            format,
+            data: AlignedBuffer::zeroed(padded * words),
+            k,
+            n,
+            columns,
+            slice,
+            factors: vec![0.0; if format == Format::Int8 { padded } else { 0 }],
+            offsets: vec![0; if format == Format::Int8 { padded * slices } else { 0 }],
+        };
+        let mut values = vec![0.0; words * format.per_word()];
         for column in 0..n {
-            let (panel, lane) = (column / columns, column % columns);
-            for row in 0..k {
-                data[(panel * k + row) * columns + lane] = element(row, column);
+            values[..k].iter_mut().enumerate().for_each(|(row, value)| *value = element(row, column));
+            packed.pack_column(column, words, &values);
+        }
+        packed
+    }
+
+    fn pack_column(&mut self, column: usize, words: usize, values: &[f32]) {
+        let largest = values.iter().fold(f32::MIN_POSITIVE * 256.0, |a, b| a.max(b.abs()));
+        let code = |value: f32| (value / largest * 127.0).round_ties_even() as i8;
+        let place = column / self.columns * words * self.columns + column % self.columns;
+        for (word, numbers) in values.chunks_exact(self.format.per_word()).enumerate() {
+            self.data[place + word * self.columns] = match *numbers {
+                [value] => value.to_bits(),
+                [low, high] => {
+                    let bits = |value| u32::from(half::bf16::from_f32(value).to_bits());
+                    bits(low) | bits(high) << 16
+                }
+                _ => u32::from_le_bytes(std::array::from_fn(|part| code(numbers[part]).cast_unsigned())),
+            };
+        }
+        if self.format == Format::Int8 {
+            self.factors[column] = largest / 127.0;
+            let padded = self.factors.len();
+            for (slice, values) in values[..self.k].chunks(self.slice).enumerate() {
+                self.offsets[slice * padded + column] = 128 * values.iter().map(|&v| i32::from(code(v))).sum::<i32>();
             }
         }
-        Self { data, k, n, columns }
+    }
+
+    /// How its numbers are stored.
+    pub fn format(&self) -> Format {
+        self.format
     }
 
     /// Rows, the length of the sums.
@@ -74,42 +142,46 @@ impl PackedMatrix {
         self.n.div_ceil(self.columns)
     }
 
-    /// Rows `from..to` of one panel, `[to - from, columns]`.
-    pub fn panel_rows(&self, panel: usize, from: usize, to: usize) -> &[f32] {
-        &self.data[(panel * self.k + from) * self.columns..(panel * self.k + to) * self.columns]
+    /// Slice `slice` of one panel.
+    pub fn panel(&self, panel: usize, slice: usize) -> Panel<'_> {
+        let (from, to) = (slice * self.slice, self.k.min((slice + 1) * self.slice));
+        let (start, words) = (panel * self.format.words(self.k), self.format.words(to) - self.format.words(from));
+        let first = (start + self.format.words(from)) * self.columns;
+        Panel::whole(&self.data[first..first + words * self.columns], words)
+    }
+
+    /// What turns that slice's sums into numbers; `None` where they are numbers already.
+    pub fn codes(&self, panel: usize, slice: usize) -> Option<PanelCodes<'_>> {
+        let at = panel * self.columns;
+        let offsets = slice * self.factors.len() + at;
+        (self.format == Format::Int8).then(|| PanelCodes {
+            factors: &self.factors[at..at + self.columns],
+            offsets: &self.offsets[offsets..offsets + self.columns],
+        })
     }
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        size_of_val::<[f32]>(&self.data)
+        size_of_val::<[u32]>(&self.data) + size_of_val(&self.factors[..]) + size_of_val(&self.offsets[..])
     }
-}
-
-/// Row-major rows: row `i` starts at `i * stride`.
-#[derive(Debug, Clone, Copy)]
-pub struct Rows<'a> {
-    /// All rows.
-    pub data: &'a [f32],
-    /// Elements from one row to the next.
-    pub stride: usize,
 }
 
 /// One panel of a right-hand side, cut along k into segments that need not be adjacent.
 #[derive(Debug, Clone, Copy)]
 pub struct Panel<'a> {
-    /// From the first element of the first segment; each segment is `[<= segment_rows, columns]`.
-    pub data: &'a [f32],
-    /// Length of the sums.
+    /// From the first word of the first segment; each segment is `[<= segment_rows, columns]`.
+    pub data: &'a [u32],
+    /// Length of the sums in words.
     pub k: usize,
     /// Rows of a segment; the last may be cut short by `k`.
     pub segment_rows: usize,
-    /// Elements from one segment to the next.
+    /// Words from one segment to the next.
     pub segment_stride: usize,
 }
 
 impl<'a> Panel<'a> {
     /// A panel in one piece, `[k, columns]`.
-    pub fn whole(data: &'a [f32], k: usize) -> Self {
+    pub fn whole(data: &'a [u32], k: usize) -> Self {
         Self { data, k, segment_rows: k.max(1), segment_stride: 0 }
     }
 
@@ -121,19 +193,19 @@ impl<'a> Panel<'a> {
     }
 }
 
-/// `out = left x panel`, or `out += left x panel` if `accumulate`, for `rows` rows (a multiple of [`Tiling::rows`]);
-/// row `i` of the result is the first `columns` elements at `out[i * out_stride]`.
+/// `out = left x panel` for `rows` rows (a multiple of [`Tiling::rows`]); row `i` of the result is the first `columns`
+/// elements at `out[i * out_stride]`. Both sides are in `format`; for int8 the results are the bits of i32.
 ///
 /// # Panics
-/// If a slice is too short for what it is said to hold.
+/// If a slice is too short for what it is said to hold, or the format is not available at this level.
 pub fn multiply_panel(
     simd: Simd,
+    format: Format,
     rows: usize,
     left: Rows<'_>,
     panel: Panel<'_>,
     out: &mut [f32],
     out_stride: usize,
-    accumulate: bool,
 ) {
     let tile = Tiling::of(simd);
     assert_eq!(rows % tile.rows, 0, "rows must be whole tiles");
@@ -151,40 +223,54 @@ pub fn multiply_panel(
         k: panel.k,
         segment_rows: panel.segment_rows,
         segment_stride: panel.segment_stride,
-        out: out.as_mut_ptr(),
+        out: out.as_mut_ptr().cast(),
         out_stride,
-        accumulate,
     };
-    at_level!(
-        simd,
-        (job: &TileJob = &job),
-        job.run::<Portable, 4, 1>(),
-        job.run::<Avx2, 6, 2>(),
-        job.run::<Avx512, 8, 2>(),
-    );
+    match format {
+        Format::F32 => at_level!(
+            simd,
+            (job: &TileJob = &job),
+            job.run::<Portable, 4, 1>(),
+            job.run::<Avx2, 6, 2>(),
+            job.run::<Avx512, 12, 2>(),
+        ),
+        Format::Bf16 => at_bf16_level!(
+            simd,
+            (job: &TileJob = &job),
+            job.run::<PortableBf16, 4, 1>(),
+            job.run::<PortableBf16, 6, 2>(),
+            job.run::<Avx512Bf16, 12, 2>(),
+        ),
+        Format::Int8 => at_level!(
+            simd,
+            (job: &TileJob = &job),
+            job.run::<PortableInt8, 4, 1>(),
+            job.run::<PortableInt8, 6, 2>(),
+            job.run::<Avx512Int8, 12, 2>(),
+        ),
+    }
 }
 
 /// The checked arguments of [`multiply_panel`].
 struct TileJob {
     rows: usize,
-    left: *const f32,
+    left: *const u32,
     left_stride: usize,
-    right: *const f32,
+    right: *const u32,
     k: usize,
     segment_rows: usize,
     segment_stride: usize,
-    out: *mut f32,
+    out: *mut u32,
     out_stride: usize,
-    accumulate: bool,
 }
 
 impl TileJob {
     #[inline(always)]
-    unsafe fn run<V: Lanes, const MR: usize, const NV: usize>(&self) {
+    unsafe fn run<D: Dot, const MR: usize, const NV: usize>(&self) {
         for row in (0..self.rows).step_by(MR) {
             // SAFETY: `multiply_panel` has checked that MR rows from here lie inside both slices.
             unsafe {
-                self.tile::<V, MR, NV>(self.left.add(row * self.left_stride), self.out.add(row * self.out_stride));
+                self.tile::<D, MR, NV>(self.left.add(row * self.left_stride), self.out.add(row * self.out_stride));
             }
         }
     }
@@ -193,36 +279,28 @@ impl TileJob {
     // afford; `multiply_panel` has checked once that every access lies inside its slice.
     #[allow(clippy::needless_range_loop)] // Indices keep the sums in registers; iterators leave them in memory.
     #[inline(always)]
-    unsafe fn tile<V: Lanes, const MR: usize, const NV: usize>(&self, left: *const f32, out: *mut f32) {
-        let vectors: [usize; NV] = std::array::from_fn(|vector| vector * V::COUNT);
-        let mut rows: [*const f32; MR] = std::array::from_fn(|row| left.wrapping_add(row * self.left_stride));
-        let places: [*mut f32; MR] = std::array::from_fn(|row| out.wrapping_add(row * self.out_stride));
+    unsafe fn tile<D: Dot, const MR: usize, const NV: usize>(&self, left: *const u32, out: *mut u32) {
+        let vectors: [usize; NV] = std::array::from_fn(|vector| vector * D::COUNT);
+        let mut rows: [*const u32; MR] = std::array::from_fn(|row| left.wrapping_add(row * self.left_stride));
         // SAFETY: the extents were checked by `multiply_panel`; the level's instructions are available.
         unsafe {
-            let mut sums = [[V::splat(0.0); NV]; MR];
-            if self.accumulate {
-                for row in 0..MR {
-                    for vector in 0..NV {
-                        sums[row][vector] = V::load(places[row].wrapping_add(vectors[vector]));
-                    }
-                }
-            }
+            let mut sums = [[D::zero(); NV]; MR];
             let (mut segment, mut remaining) = (self.right, self.k);
             while remaining > 0 {
                 let count = remaining.min(self.segment_rows);
                 let mut right = segment;
                 for at in 0..count {
-                    let mut columns = [V::splat(0.0); NV];
+                    let mut columns = [D::zero(); NV];
                     for vector in 0..NV {
-                        columns[vector] = V::load(right.wrapping_add(vectors[vector]));
+                        columns[vector] = D::load(right.wrapping_add(vectors[vector]));
                     }
                     for row in 0..MR {
-                        let factor = V::broadcast(rows[row].wrapping_add(at));
+                        let word = D::broadcast(rows[row].wrapping_add(at));
                         for vector in 0..NV {
-                            sums[row][vector] = factor.mul_add(columns[vector], sums[row][vector]);
+                            sums[row][vector] = sums[row][vector].add_dot(word, columns[vector]);
                         }
                     }
-                    right = right.wrapping_add(NV * V::COUNT);
+                    right = right.wrapping_add(NV * D::COUNT);
                 }
                 rows = rows.map(|row| row.wrapping_add(count));
                 remaining -= count;
@@ -230,32 +308,67 @@ impl TileJob {
             }
             for row in 0..MR {
                 for vector in 0..NV {
-                    sums[row][vector].store(places[row].wrapping_add(vectors[vector]));
+                    sums[row][vector].store(out.wrapping_add(row * self.out_stride + vectors[vector]));
                 }
             }
         }
     }
 }
 
-/// The kernel against a plain sum on small odd sizes.
+/// The kernel against a plain sum on small odd sizes, in every format of the level.
 pub(super) fn check(simd: Simd) -> Result<(), String> {
+    for format in Format::ALL.into_iter().filter(|format| format.is_available(simd)) {
+        for (k, n, slice) in [(16, 1, 16), (48, 37, 32), (64, 64, 64)] {
+            compare_with_plain_sums(simd, format, 2, (k, n), slice)?;
+        }
+    }
+    Ok(())
+}
+
+/// Multiplies as the transformer does, slice by slice through the epilogue, and compares with f64 sums over what both
+/// sides hold.
+fn compare_with_plain_sums(
+    simd: Simd,
+    format: Format,
+    tiles: usize,
+    (k, n): (usize, usize),
+    slice: usize,
+) -> Result<(), String> {
+    use super::elementwise::{Epilogue, Product, finish_block};
+    use super::operand::OperandBuffer;
     use super::testing::{differ, ramp};
-    let tile = Tiling::of(simd);
-    for (k, n) in [(1, 1), (7, 37), (61, 64)] {
-        let (rows, stride) = (2 * tile.rows, k + 3);
-        let (left, right) = (ramp(rows * stride, 1), ramp(k * n, 2));
-        let packed = PackedMatrix::pack(simd, k, n, |row, column| right[row * n + column]);
-        for panel in 0..packed.panels() {
-            let mut out = vec![0.5; rows * tile.columns];
-            let whole = Panel::whole(packed.panel_rows(panel, 0, k), k);
-            multiply_panel(simd, rows, Rows { data: &left, stride }, whole, &mut out, tile.columns, true);
-            for (index, &actual) in out.iter().enumerate() {
-                let (row, column) = (index / tile.columns, panel * tile.columns + index % tile.columns);
-                let term = |i: usize| f64::from(left[row * stride + i]) * f64::from(right[i * n + column]);
-                let expected = 0.5 + if column < n { (0..k).map(term).sum::<f64>() } else { 0.0 };
-                if differ(actual, expected, 1e-4) {
-                    return Err(format!("k {k}, n {n}, row {row}, column {column}: {actual} is not {expected}"));
-                }
+    let (tile, stride) = (Tiling::of(simd), k + 3);
+    let rows = tiles * tile.rows;
+    let (left, right) = (ramp(rows * stride, 1), ramp(k * n, 2));
+    let matrix = PackedMatrix::pack(simd, format, (k, n), slice, |row, column| right[row * n + column]);
+    let bias = vec![0.25; tile.columns];
+    // A code is off by half a step of its row or column; a sum of k products by what that adds up to, and rarely so much.
+    let tolerance = match format {
+        Format::F32 => 1e-4,
+        Format::Bf16 => 4e-3 * (k as f64).sqrt() + 1e-3,
+        Format::Int8 => 1e-2 * (k as f64).sqrt() + 1e-3,
+    };
+    for panel in 0..matrix.panels() {
+        let mut out = vec![0.5f32; rows * tile.columns];
+        for (index, from) in (0..k).step_by(slice).enumerate() {
+            let mut buffer = OperandBuffer::default();
+            let width = slice.min(k - from);
+            let packed = buffer.pack(simd, format, rows, width, (&left[from..], stride));
+            let mut block = vec![f32::NAN; rows * tile.columns];
+            multiply_panel(simd, format, rows, packed.rows, matrix.panel(panel, index), &mut block, tile.columns);
+            let bias = if index == 0 { Some(&bias[..]) } else { None };
+            let product =
+                Product { rows, block: &block, codes: matrix.codes(panel, index), factors: packed.factors, bias };
+            finish_block(simd, Epilogue::BiasResidual, product, &mut out, tile.columns);
+        }
+        for (at, &actual) in out.iter().enumerate() {
+            let (row, column) = (at / tile.columns, panel * tile.columns + at % tile.columns);
+            let term = |i: usize| f64::from(left[row * stride + i]) * f64::from(right[i * n + column]);
+            let expected = 0.75 + if column < n { (0..k).map(term).sum::<f64>() } else { 0.0 };
+            if differ(actual, expected, tolerance) {
+                return Err(format!(
+                    "{format:?}, k {k}, n {n}, row {row}, column {column}: {actual} is not {expected}"
+                ));
             }
         }
     }
@@ -265,30 +378,35 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernels::operand::OperandBuffer;
     use crate::kernels::testing::ramp;
     use proptest::prelude::*;
 
     proptest! {
         #[test]
-        fn equals_the_plain_sum(k in 1usize..90, n in 1usize..70, tiles in 1usize..4, seed in 0u32..1000) {
+        fn equals_the_plain_sum(steps in 1usize..7, n in 1usize..70, tiles in 1usize..4, slice in 1usize..4) {
             for simd in Simd::all() {
-                let tile = Tiling::of(simd);
-                let rows = tiles * tile.rows;
-                let (left, right) = (ramp(rows * k, seed), ramp(k * n, seed + 1));
-                let packed = PackedMatrix::pack(simd, k, n, |row, column| right[row * n + column]);
-                let mut out = vec![f32::NAN; rows * tile.columns];
-                for panel in 0..packed.panels() {
-                    let whole = Panel::whole(packed.panel_rows(panel, 0, k), k);
-                    multiply_panel(simd, rows, Rows { data: &left, stride: k }, whole, &mut out, tile.columns, false);
-                    for row in 0..rows {
-                        for lane in 0..tile.columns.min(n - panel * tile.columns) {
-                            let column = panel * tile.columns + lane;
-                            let expected: f64 = (0..k)
-                                .map(|i| f64::from(left[row * k + i]) * f64::from(right[i * n + column])).sum();
-                            prop_assert!((f64::from(out[row * tile.columns + lane]) - expected).abs() < 1e-4);
-                        }
-                    }
+                for format in Format::ALL.into_iter().filter(|format| format.is_available(simd)) {
+                    let compared = compare_with_plain_sums(simd, format, tiles, (16 * steps, n), 16 * slice);
+                    prop_assert_eq!(compared, Ok(()));
                 }
+            }
+        }
+
+        #[test]
+        fn sums_of_integers_equal_the_scalar_twins_bit_for_bit(steps in 1usize..9, seed in 0u32..1000) {
+            let k = 16 * steps;
+            let (left, right) = (ramp(12 * k, seed), ramp(k * 8, seed + 1));
+            let run = |simd: Simd| {
+                let (tile, mut buffer) = (Tiling::of(simd), OperandBuffer::default());
+                let matrix = PackedMatrix::pack(simd, Format::Int8, (k, 8), k, |row, column| right[row * 8 + column]);
+                let packed = buffer.pack(simd, Format::Int8, 12, k, (&left, k));
+                let mut out = vec![0.0; 12 * tile.columns];
+                multiply_panel(simd, Format::Int8, 12, packed.rows, matrix.panel(0, 0), &mut out, tile.columns);
+                (0..12 * 8).map(|at| out[at / 8 * tile.columns + at % 8].to_bits()).collect::<Vec<_>>()
+            };
+            for simd in Simd::all() {
+                prop_assert_eq!(run(simd), run(Simd::SCALAR));
             }
         }
 
@@ -296,9 +414,10 @@ mod tests {
         fn segments_give_bit_for_bit_what_one_piece_gives(k in 1usize..60, segment_rows in 1usize..20) {
             for simd in Simd::all() {
                 let tile = Tiling::of(simd);
-                let (left, right) = (ramp(tile.rows * k, 3), ramp(k * tile.columns, 4));
+                let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect::<Vec<_>>();
+                let (left, right) = (ramp(tile.rows * k, 3), bits(ramp(k * tile.columns, 4)));
                 let segment_stride = segment_rows * tile.columns + 5;
-                let mut scattered = vec![f32::NAN; k.div_ceil(segment_rows) * segment_stride];
+                let mut scattered = vec![f32::NAN.to_bits(); k.div_ceil(segment_rows) * segment_stride];
                 for row in 0..k {
                     let at = row / segment_rows * segment_stride + row % segment_rows * tile.columns;
                     scattered[at..at + tile.columns]
@@ -306,8 +425,7 @@ mod tests {
                 }
                 let run = |panel| {
                     let mut out = vec![0.0; tile.rows * tile.columns];
-                    let left = Rows { data: &left, stride: k };
-                    multiply_panel(simd, tile.rows, left, panel, &mut out, tile.columns, false);
+                    multiply_panel(simd, Format::F32, tile.rows, Rows::f32(&left, k), panel, &mut out, tile.columns);
                     out
                 };
                 let panel = Panel { data: &scattered, k, segment_rows, segment_stride };
@@ -320,7 +438,7 @@ mod tests {
     #[should_panic(expected = "panel too short")]
     fn a_short_panel_is_refused() {
         let tile = Tiling::of(Simd::SCALAR);
-        let left = Rows { data: &[0.0; 64], stride: 8 };
-        multiply_panel(Simd::SCALAR, tile.rows, left, Panel::whole(&[0.0; 9], 8), &mut [0.0; 64], 8, false);
+        let (left, panel) = (Rows::f32(&[0.0; 64], 8), Panel::whole(&[0; 9], 8));
+        multiply_panel(Simd::SCALAR, Format::F32, tile.rows, left, panel, &mut [0.0; 64], 8);
     }
 }

@@ -36,8 +36,38 @@ pub(super) trait Lanes: Copy {
     unsafe fn max(self, other: Self) -> Self;
     /// 2^n of a value that is `n + ROUNDING`, -126 <= n <= 127.
     unsafe fn power_of_two(self) -> Self;
+    /// The bits of `self` less those of `other`, both taken as i32, as floats.
+    unsafe fn integer_difference(self, other: Self) -> Self;
     unsafe fn sum(self) -> f32;
     unsafe fn maximum(self) -> f32;
+
+    /// Stores bf16, rounded to the nearest, two to a word: `COUNT / 2` words. At the highest level only where the CPU
+    /// has AVX-512 BF16.
+    #[inline(always)]
+    unsafe fn store_bf16(self, to: *mut u32) {
+        let mut values = [0.0f32; 16];
+        // SAFETY: the caller vouches for the words at `to`; 16 is the longest vector.
+        unsafe {
+            self.store(values.as_mut_ptr());
+            for (pair, values) in values[..Self::COUNT].chunks_exact(2).enumerate() {
+                let bits = |value: f32| u32::from(half::bf16::from_f32(value).to_bits());
+                to.add(pair).write_unaligned(bits(values[0]) | bits(values[1]) << 16);
+            }
+        }
+    }
+
+    /// Stores the values, rounded to the nearest, as `COUNT` bytes; they must lie in 0..=255.
+    #[inline(always)]
+    unsafe fn store_u8(self, to: *mut u8) {
+        let mut values = [0.0f32; 16];
+        // SAFETY: the caller vouches for the bytes at `to`.
+        unsafe {
+            self.store(values.as_mut_ptr());
+            for (at, value) in values[..Self::COUNT].iter().enumerate() {
+                to.add(at).write(value.round_ties_even() as u8);
+            }
+        }
+    }
 
     /// The first `count` elements, the others `fill`.
     #[inline(always)]
@@ -154,6 +184,10 @@ impl Lanes for Portable {
         Self(self.0.map(|value| f32::from_bits(value.to_bits().wrapping_add(127) << 23)))
     }
     #[inline(always)]
+    unsafe fn integer_difference(self, other: Self) -> Self {
+        self.zip(other, |a, b| a.to_bits().wrapping_sub(b.to_bits()).cast_signed() as f32)
+    }
+    #[inline(always)]
     unsafe fn sum(self) -> f32 {
         self.0.iter().sum()
     }
@@ -218,6 +252,13 @@ impl Lanes for Avx2 {
         unsafe {
             let biased = _mm256_add_epi32(_mm256_castps_si256(self.0), _mm256_set1_epi32(127));
             Self(_mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased)))
+        }
+    }
+    #[inline(always)]
+    unsafe fn integer_difference(self, other: Self) -> Self {
+        unsafe {
+            let (a, b) = (_mm256_castps_si256(self.0), _mm256_castps_si256(other.0));
+            Self(_mm256_cvtepi32_ps(_mm256_sub_epi32(a, b)))
         }
     }
     #[inline(always)]
@@ -296,6 +337,22 @@ impl Lanes for Avx512 {
         }
     }
     #[inline(always)]
+    unsafe fn integer_difference(self, other: Self) -> Self {
+        unsafe {
+            let (a, b) = (_mm512_castps_si512(self.0), _mm512_castps_si512(other.0));
+            Self(_mm512_cvtepi32_ps(_mm512_sub_epi32(a, b)))
+        }
+    }
+    #[inline(always)]
+    unsafe fn store_bf16(self, to: *mut u32) {
+        // A bit pattern of 256 bits is a valid vector of integers.
+        unsafe { write::<__m256i>(to.cast(), std::mem::transmute::<__m256bh, __m256i>(_mm512_cvtneps_pbh(self.0))) }
+    }
+    #[inline(always)]
+    unsafe fn store_u8(self, to: *mut u8) {
+        unsafe { write::<__m128i>(to.cast(), _mm512_cvtusepi32_epi8(_mm512_cvtps_epi32(self.0))) }
+    }
+    #[inline(always)]
     unsafe fn sum(self) -> f32 {
         unsafe { _mm512_reduce_add_ps(self.0) }
     }
@@ -311,7 +368,39 @@ impl Lanes for Avx512 {
 /// the expressions see the named arguments.
 macro_rules! at_level {
     ($simd:expr, ($($name:ident: $type:ty = $value:expr),* $(,)?) $(-> $return:ty)?,
+     $portable:expr, $avx2:expr, $avx512:expr $(,)?) => {
+        $crate::kernels::lanes::instances!(
+            "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni,avx2,fma",
+            $simd, ($($name: $type = $value),*) $(-> $return)?, $portable, $avx2, $avx512
+        )
+    };
+}
+pub(super) use at_level;
+
+/// As [`at_level!`], for kernels whose highest instance uses AVX-512 BF16 too.
+///
+/// # Panics
+/// At the highest level of a CPU without it: callers ask [`Format::is_available`](super::operand::Format) first.
+macro_rules! at_bf16_level {
+    ($simd:expr, ($($name:ident: $type:ty = $value:expr),* $(,)?) $(-> $return:ty)?,
      $portable:expr, $avx2:expr, $avx512:expr $(,)?) => {{
+        let simd: $crate::kernels::Simd = $simd;
+        assert!(
+            simd.level() != $crate::kernels::SimdLevel::Avx512 || simd.has_bf16_dot(),
+            "this CPU has no AVX-512 BF16"
+        );
+        $crate::kernels::lanes::instances!(
+            "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni,avx512bf16,avx2,fma",
+            simd, ($($name: $type = $value),*) $(-> $return)?, $portable, $avx2, $avx512
+        )
+    }};
+}
+pub(super) use at_bf16_level;
+
+/// What the two macros above share; the first argument is what the highest instance is compiled for.
+macro_rules! instances {
+    ($features:tt, $simd:expr, ($($name:ident: $type:ty = $value:expr),*) $(-> $return:ty)?,
+     $portable:expr, $avx2:expr, $avx512:expr) => {{
         #[inline(never)]
         unsafe fn portable($($name: $type),*) $(-> $return)? {
             // SAFETY: no instructions beyond the baseline; the caller vouches for the arguments.
@@ -324,7 +413,7 @@ macro_rules! at_level {
             unsafe { $avx2 }
         }
         #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni,avx2,fma")]
+        #[target_feature(enable = $features)]
         unsafe fn avx512($($name: $type),*) $(-> $return)? {
             // SAFETY: called only below; the caller vouches for the arguments.
             unsafe { $avx512 }
@@ -341,4 +430,4 @@ macro_rules! at_level {
         }
     }};
 }
-pub(super) use at_level;
+pub(super) use instances;

@@ -7,6 +7,8 @@
 //! | [`homography`] | four-point homographies and inlier counts, in vectors |
 //! | [`similarity`] | best partners among int8 descriptors: running row and column maxima |
 //! | [`gemm`], [`elementwise`], [`attention`] | the transformer: packed products, what lies between them, blocked softmax attention |
+//! | [`peak`] | what the machine can do at most, for benchmarks |
+//! | [`operand`], `dot` | the formats of a product: f32, bf16, int8 |
 //! | `lanes`, [`aligned`] | a vector register by level; buffers on cache lines |
 //!
 //! Every kernel takes a [`Simd`] and has a portable twin, which tests compare it with over odd sizes. Where tests ran
@@ -15,16 +17,21 @@
 
 pub mod aligned;
 pub mod attention;
+mod dot;
 pub mod elementwise;
 pub mod gemm;
 #[allow(clippy::needless_range_loop, reason = "lanes, corners and halves index several arrays at once")]
 pub mod homography;
 mod lanes;
+pub mod operand;
+pub mod peak;
 pub mod scan;
 pub mod simd;
 #[allow(clippy::needless_range_loop, reason = "sections and halves index several arrays at once")]
 pub mod similarity;
 mod testing;
+
+use std::sync::OnceLock;
 
 pub use simd::{Simd, SimdError, SimdLevel};
 
@@ -41,15 +48,19 @@ const CHECKS: &[(&str, Check)] = &[
     ("attention", attention::check),
 ];
 
-/// Chooses the level and compares every kernel at it with its scalar twin (a few milliseconds). Programs call this
-/// once at start.
+/// Chooses the level and compares every kernel at it with its scalar twin: a few milliseconds, once in a process
+/// however often it is asked.
 ///
 /// # Errors
 /// `PLACEFORMER_SIMD` names no level or one this CPU lacks; or a kernel disagrees with its twin.
 pub fn self_check() -> Result<Simd, SimdError> {
-    let simd = simd::try_selected()?;
-    check_level(simd, CHECKS)?;
-    Ok(simd)
+    static OUTCOME: OnceLock<Result<Simd, SimdError>> = OnceLock::new();
+    let check = || {
+        let simd = simd::try_selected()?;
+        check_level(simd, CHECKS)?;
+        Ok(simd)
+    };
+    OUTCOME.get_or_init(check).clone()
 }
 
 fn check_level(simd: Simd, checks: &[(&'static str, Check)]) -> Result<(), SimdError> {

@@ -151,6 +151,7 @@ pub struct Metrics {
     top1_score: Histogram,
     unmatched: IntCounter,
     corrupt_records: IntCounter,
+    quarantined: IntGauge,
     cache_lookups: IntCounterVec,
 }
 
@@ -174,7 +175,8 @@ impl Metrics {
                     .buckets(SCORES.to_vec()),
             )?,
             unmatched: IntCounter::new(full("query_unmatched_total"), "Queries whose best answer is not trusted.")?,
-            corrupt_records: IntCounter::new(full("corrupt_records_total"), "Stored records found damaged.")?,
+            corrupt_records: IntCounter::new(full("corrupt_records_total"), "Damaged records that queries met.")?,
+            quarantined: IntGauge::new(full("quarantined_references"), "Damaged references set aside, not served.")?,
             cache_lookups: counter("patch_cache_lookups_total", "Key patches asked of the cache.", &["result"])?,
         };
         metrics.register()?;
@@ -197,6 +199,7 @@ impl Metrics {
         self.registry.register(Box::new(self.top1_score.clone()))?;
         self.registry.register(Box::new(self.unmatched.clone()))?;
         self.registry.register(Box::new(self.corrupt_records.clone()))?;
+        self.registry.register(Box::new(self.quarantined.clone()))?;
         self.registry.register(Box::new(self.cache_lookups.clone()))?;
         self.registry.register(Box::new(prometheus::process_collector::ProcessCollector::for_self()))
     }
@@ -244,9 +247,14 @@ impl Metrics {
         self.rejected.with_label_values(&[reason.as_str()]).inc();
     }
 
-    /// Requests in or before compute.
-    pub fn set_queue_depth(&self, depth: usize) {
-        self.queue_depth.set(depth as i64);
+    /// A request joined those waiting for or in compute.
+    pub fn queue_entered(&self) {
+        self.queue_depth.inc();
+    }
+
+    /// It left them.
+    pub fn queue_left(&self) {
+        self.queue_depth.dec();
     }
 
     /// A reference was stored with descriptors of these sizes in bytes.
@@ -255,10 +263,13 @@ impl Metrics {
         self.descriptor_bytes.with_label_values(&["patches"]).observe(patches as f64);
     }
 
-    /// A re-ranked query's best S (0 without any answer), and whether it is trusted.
-    pub fn query_answered(&self, top1_score: u32, matched: bool) {
-        self.top1_score.observe(f64::from(top1_score));
-        if !matched {
+    /// A query's best S (0 without any answer, `None` if it was not re-ranked), and whether that answer is trusted
+    /// (`None` if nobody can say).
+    pub fn query_answered(&self, top1_score: Option<u32>, matched: Option<bool>) {
+        if let Some(score) = top1_score {
+            self.top1_score.observe(f64::from(score));
+        }
+        if matched == Some(false) {
             self.unmatched.inc();
         }
     }
@@ -266,6 +277,11 @@ impl Metrics {
     /// A stored record failed its checksum.
     pub fn corrupt_record(&self) {
         self.corrupt_records.inc();
+    }
+
+    /// Damaged references that are set aside until they are sent again or deleted.
+    pub fn set_quarantined(&self, references: usize) {
+        self.quarantined.set(references as i64);
     }
 
     /// The patch cache was asked.

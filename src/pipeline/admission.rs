@@ -1,7 +1,10 @@
-//! The door: how many requests may wait for or be in compute at once.
+//! The door: how many requests may wait for or be in compute at once, and for how long.
 //!
-//! Waiting costs memory and, worse, time that the caller may not have; beyond the bound a request is refused at
-//! once, with the time after which a place is likely to be free.
+//! Waiting costs memory and, worse, time that the caller may not have. A request whose turn would come too late, by the
+//! pace at which others leave, is refused at once with the time after which it is worth trying again; so what is let in
+//! is answered soon, however much is asked.
+//!
+//! Queries and ingest each have a door of their own: a bulk import must not turn vehicles away.
 
 use super::PipelineError;
 use crate::ops::Metrics;
@@ -11,10 +14,13 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+/// Requests let in while nothing is known about the pace yet.
+const PLACES_AT_UNKNOWN_PACE: usize = 8;
+
 pub(super) struct Admission {
     places: Arc<Semaphore>,
     capacity: usize,
-    /// Smoothed time between two departures in microseconds, while busy.
+    /// Smoothed time between two departures in microseconds, while busy; 0 before the first.
     departure_us: AtomicU64,
     last_departure: Mutex<Instant>,
     metrics: Arc<Metrics>,
@@ -38,29 +44,28 @@ impl Admission {
         })
     }
 
-    /// Takes a place, or says when to come back.
-    pub(super) fn enter(self: &Arc<Self>) -> Result<Ticket, PipelineError> {
+    /// Takes a place if the turn will come within `patience`, or says when to come back.
+    pub(super) fn enter(self: &Arc<Self>, patience: Duration) -> Result<Ticket, PipelineError> {
+        let inside = self.depth();
+        let pace = self.departure_us.load(Ordering::Relaxed);
+        let wait = Duration::from_micros(pace.saturating_mul(inside as u64));
+        let too_late =
+            if pace == 0 { inside >= PLACES_AT_UNKNOWN_PACE && patience < Duration::MAX } else { wait > patience };
         match self.places.clone().try_acquire_owned() {
-            Ok(place) => {
-                self.metrics.set_queue_depth(self.depth());
+            Ok(place) if !too_late => {
+                self.metrics.queue_entered();
                 Ok(Ticket { place: Some(place), admission: self.clone(), entered: Instant::now() })
             }
-            Err(_) => {
+            _ => {
                 self.metrics.rejected(Rejection::QueueFull);
-                Err(PipelineError::Overloaded { waiting: self.capacity, retry_after: self.drain_time() })
+                Err(PipelineError::Overloaded { waiting: inside, retry_after: come_back_after(wait, patience) })
             }
         }
     }
 
     /// Requests inside.
-    pub(super) fn depth(&self) -> usize {
+    fn depth(&self) -> usize {
         self.capacity - self.places.available_permits()
-    }
-
-    /// How long half the queue needs to drain at the current pace, 1 to 30 seconds.
-    fn drain_time(&self) -> Duration {
-        let half = Duration::from_micros(self.departure_us.load(Ordering::Relaxed)) * (self.capacity as u32 / 2);
-        half.clamp(Duration::from_secs(1), Duration::from_secs(30))
     }
 
     fn departed(&self, entered: Instant) {
@@ -70,15 +75,22 @@ impl Admission {
         let gap = now.saturating_duration_since((*last).max(entered)).as_micros() as u64;
         *last = now;
         let smoothed = self.departure_us.load(Ordering::Relaxed);
-        self.departure_us.store(if smoothed == 0 { gap } else { (smoothed * 7 + gap) / 8 }, Ordering::Relaxed);
+        let next = if smoothed == 0 { gap } else { (smoothed * 7 + gap) / 8 };
+        self.departure_us.store(next.max(1), Ordering::Relaxed);
     }
+}
+
+/// Until half of what waits too long has left, 1 to 30 seconds.
+fn come_back_after(wait: Duration, patience: Duration) -> Duration {
+    let beyond = wait.saturating_sub(patience.min(wait) / 2);
+    beyond.clamp(Duration::from_secs(1), Duration::from_secs(30))
 }
 
 impl Drop for Ticket {
     fn drop(&mut self) {
         self.place.take();
         self.admission.departed(self.entered);
-        self.admission.metrics.set_queue_depth(self.admission.depth());
+        self.admission.metrics.queue_left();
     }
 }
 
@@ -86,15 +98,40 @@ impl Drop for Ticket {
 mod tests {
     use super::*;
 
+    fn admission(capacity: usize) -> Arc<Admission> {
+        Admission::new(capacity, Arc::new(Metrics::new().unwrap()))
+    }
+
     #[test]
     fn the_door_closes_when_full_and_opens_again() {
-        let admission = Admission::new(2, Arc::new(Metrics::new().unwrap()));
-        let first = admission.enter().ok().unwrap();
-        let _second = admission.enter().ok().unwrap();
+        let admission = admission(2);
+        let first = admission.enter(Duration::MAX).ok().unwrap();
+        let _second = admission.enter(Duration::MAX).ok().unwrap();
         assert_eq!(admission.depth(), 2);
-        let Err(refused) = admission.enter() else { panic!("a third was let in") };
+        let Err(refused) = admission.enter(Duration::MAX) else { panic!("a third was let in") };
         assert!(refused.retry_after().unwrap() >= Duration::from_secs(1));
         drop(first);
-        assert!(admission.enter().is_ok());
+        assert!(admission.enter(Duration::MAX).is_ok());
+    }
+
+    #[test]
+    fn who_would_wait_too_long_is_refused_and_who_finds_nobody_is_not() {
+        let admission = admission(100);
+        admission.departure_us.store(300_000, Ordering::Relaxed);
+        let patience = Duration::from_secs(1);
+        let inside: Vec<_> = (0..4).map(|_| admission.enter(patience).ok().unwrap()).collect();
+        let Err(refused) = admission.enter(patience) else { panic!("a fifth would wait 1.2 s") };
+        assert_eq!(refused.retry_after(), Some(Duration::from_secs(1)));
+        assert!(admission.enter(Duration::from_secs(2)).is_ok(), "the more patient are let in");
+        drop(inside);
+        admission.departure_us.store(60_000_000, Ordering::Relaxed);
+        assert!(admission.enter(patience).is_ok(), "an idle server always tries");
+    }
+
+    #[test]
+    fn a_burst_at_unknown_pace_is_bounded() {
+        let admission = admission(100);
+        let inside: Vec<_> = (0..20).map_while(|_| admission.enter(Duration::from_secs(1)).ok()).collect();
+        assert_eq!(inside.len(), PLACES_AT_UNKNOWN_PACE);
     }
 }

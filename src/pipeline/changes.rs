@@ -4,7 +4,7 @@ use super::blocking::blocking;
 use super::{PipelineError, Service};
 use crate::search::IndexEntry;
 use crate::store::ReferencePatch;
-use crate::types::{MapName, Reference, ReferenceFields, ReferenceId};
+use crate::types::{Calibration, MapName, Reference, ReferenceFields, ReferenceId};
 use std::sync::Arc;
 
 impl Service {
@@ -23,6 +23,15 @@ impl Service {
     /// Deletes a map with everything in it; returns how many references that were.
     pub async fn delete_map(self: &Arc<Self>, name: MapName) -> Result<u64, PipelineError> {
         self.write(move |service| service.delete_map_now(&name)).await
+    }
+
+    /// Stores a map's calibration, or clears it: from the next query on it is in force.
+    pub async fn set_calibration(
+        self: &Arc<Self>,
+        name: MapName,
+        calibration: Option<Calibration>,
+    ) -> Result<(), PipelineError> {
+        self.write(move |service| service.set_calibration_now(&name, calibration)).await
     }
 
     fn update_now(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, PipelineError> {
@@ -58,6 +67,18 @@ impl Service {
         let deleted = self.store.delete_map(name)?;
         entry.clear();
         Ok(deleted)
+    }
+
+    fn set_calibration_now(&self, name: &MapName, calibration: Option<Calibration>) -> Result<(), PipelineError> {
+        let entry = self.maps.live(name).map(|_| self.maps.entry(name));
+        let entry = entry.ok_or_else(|| PipelineError::MapNotFound(name.clone()))?;
+        let _changing = entry.changing();
+        calibration.iter().try_for_each(|calibration| self.trust.check(name, calibration))?;
+        self.store.set_calibration(name, calibration.clone())?;
+        if let Some(live) = entry.live() {
+            live.calibrate(calibration);
+        }
+        Ok(())
     }
 
     /// Runs a write to its end even if the caller goes away meanwhile: store and index change together.

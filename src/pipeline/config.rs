@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PipelineConfig {
-    /// Requests that may wait for or be in compute; one more is told to come back later.
+    /// Queries, and beside them references, that may wait for or be in compute; one more is told to come back later.
     pub queue_capacity: usize,
-    /// Most images the model sees in one batch.
-    pub max_batch: usize,
+    /// Longest time a query may wait for its turn, in milliseconds; one that would wait longer is told at once.
+    pub max_wait_ms: u64,
     /// Bytes of key patches kept in memory for the next query.
     pub patch_cache_bytes: u64,
     /// Results of a query that does not say.
@@ -23,8 +23,6 @@ pub struct PipelineConfig {
     pub deadline_ms: u64,
     /// Part of a query's time kept back for writing the answer, in milliseconds.
     pub answer_reserve_ms: u64,
-    /// S below which a best answer counts as unmatched in the metrics.
-    pub min_spatial_score: u32,
     /// Resident bytes above which nothing new is taken in; 0 means 85% of what the process may use.
     pub memory_watermark_bytes: u64,
     /// Free bytes on the store's disk below which nothing new is taken in (a twentieth of a small disk).
@@ -37,14 +35,13 @@ impl Default for PipelineConfig {
     fn default() -> Self {
         Self {
             queue_capacity: 64,
-            max_batch: 4,
+            max_wait_ms: 2000,
             patch_cache_bytes: 256 << 20,
             top_k: 10,
             candidates: 100,
             max_candidates: 1000,
             deadline_ms: 30_000,
             answer_reserve_ms: 5,
-            min_spatial_score: 40,
             memory_watermark_bytes: 0,
             disk_reserve_bytes: 64 << 20,
             max_metadata_bytes: 16 << 10,
@@ -57,7 +54,7 @@ impl PipelineConfig {
     pub fn check(&self) -> Result<(), InvalidValue> {
         let positive = [
             ("pipeline.queue_capacity", self.queue_capacity as u64),
-            ("pipeline.max_batch", self.max_batch as u64),
+            ("pipeline.max_wait_ms", self.max_wait_ms),
             ("pipeline.top_k", self.top_k as u64),
             ("pipeline.candidates", self.candidates as u64),
             ("pipeline.deadline_ms", self.deadline_ms),

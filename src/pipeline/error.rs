@@ -4,7 +4,7 @@ use crate::error::ErrorCode;
 use crate::extract::ExtractError;
 use crate::image::ImageError;
 use crate::store::StoreError;
-use crate::types::{ExternalId, InvalidValue, MapName, ModelId};
+use crate::types::{ExternalId, InvalidValue, MapName, ModelId, RerankId};
 use std::time::Duration;
 
 /// Everything that can end a request early.
@@ -38,6 +38,16 @@ pub enum PipelineError {
         /// What is loaded.
         server_model: ModelId,
     },
+    /// The calibration was fitted on scores of another re-ranking.
+    #[error("the calibration for map {map} was fitted for re-ranking \"{given}\", this server's is \"{server}\"")]
+    RerankMismatch {
+        /// The map.
+        map: MapName,
+        /// What this server does.
+        server: RerankId,
+        /// What the calibration was fitted on.
+        given: RerankId,
+    },
     /// The external id already names another image.
     #[error("external id {external_id} of map {map} belongs to another image")]
     ExternalIdConflict {
@@ -46,8 +56,8 @@ pub enum PipelineError {
         /// The id.
         external_id: ExternalId,
     },
-    /// The queue is full.
-    #[error("{waiting} requests are waiting or being computed, as many as allowed")]
+    /// The queue is full, or too long to wait in.
+    #[error("{waiting} requests are waiting or being computed, more than can be answered soon enough")]
     Overloaded {
         /// Requests in the queue.
         waiting: usize,
@@ -88,6 +98,7 @@ impl PipelineError {
             Self::Invalid(_) => ErrorCode::InvalidParameter,
             Self::MapNotFound(_) => ErrorCode::MapNotFound,
             Self::ModelMismatch { .. } => ErrorCode::ModelMismatch,
+            Self::RerankMismatch { .. } => ErrorCode::CalibrationMismatch,
             Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
             Self::Overloaded { .. } => ErrorCode::Overloaded,
             Self::MemoryPressure(_) => ErrorCode::MemoryPressure,

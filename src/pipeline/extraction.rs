@@ -10,6 +10,15 @@ use std::sync::Arc;
 use std::time::Instant;
 use tokio::sync::{Mutex, Semaphore};
 
+/// What a descriptor is for.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Purpose {
+    /// A query or a match, of no use after its deadline.
+    Answer(Deadline),
+    /// A reference to be stored; it lets queries go first.
+    Ingest,
+}
+
 pub(super) struct Extraction {
     source: Arc<dyn DescriptorSource>,
     image: Arc<ImageConfig>,
@@ -17,13 +26,23 @@ pub(super) struct Extraction {
     decoders: Semaphore,
     /// First come, first served; a waiter that is dropped leaves the line.
     worker: Mutex<()>,
+    /// Held by the one reference that stands in that line; the others wait here, so that a query never waits for more
+    /// than one of them.
+    ingest: Mutex<()>,
     metrics: Arc<Metrics>,
 }
 
 impl Extraction {
     pub(super) fn new(source: Arc<dyn DescriptorSource>, image: ImageConfig, metrics: Arc<Metrics>) -> Self {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        Self { source, image: Arc::new(image), decoders: Semaphore::new(cores), worker: Mutex::new(()), metrics }
+        Self {
+            source,
+            image: Arc::new(image),
+            decoders: Semaphore::new(cores),
+            worker: Mutex::new(()),
+            ingest: Mutex::new(()),
+            metrics,
+        }
     }
 
     pub(super) fn source(&self) -> &Arc<dyn DescriptorSource> {
@@ -36,17 +55,23 @@ impl Extraction {
     pub(super) async fn describe(
         &self,
         bytes: Bytes,
-        deadline: Option<Deadline>,
+        purpose: Purpose,
         timings: &mut Timings,
     ) -> Result<Descriptor, PipelineError> {
         let tensor = self.decode(bytes, timings).await?;
         let waiting_since = Instant::now();
+        let turn_of_ingest = match purpose {
+            Purpose::Ingest => Some(self.ingest.lock().await),
+            Purpose::Answer(_) => None,
+        };
         let turn = self.worker.lock().await;
         timings.record(&self.metrics, Stage::Queue, waiting_since.elapsed());
-        not_passed(deadline, "extraction")?;
+        if let Purpose::Answer(deadline) = purpose {
+            not_passed(deadline, "extraction")?;
+        }
         let (source, started) = (self.source.clone(), Instant::now());
         let described = blocking(move || source.describe(&[tensor])).await;
-        drop(turn);
+        drop((turn, turn_of_ingest));
         timings.record(&self.metrics, Stage::Extract, started.elapsed());
         let mut descriptors = described.map_err(|_| PipelineError::Panicked { stage: "extraction" })??;
         descriptors.pop().ok_or(PipelineError::Panicked { stage: "extraction" })
@@ -63,9 +88,6 @@ impl Extraction {
 }
 
 /// Fails once `deadline` has passed, naming the stage that it kept from running.
-pub(super) fn not_passed(deadline: Option<Deadline>, stage: &'static str) -> Result<(), PipelineError> {
-    match deadline {
-        Some(deadline) if deadline.has_passed() => Err(PipelineError::DeadlineExceeded { stage }),
-        _ => Ok(()),
-    }
+pub(super) fn not_passed(deadline: Deadline, stage: &'static str) -> Result<(), PipelineError> {
+    if deadline.has_passed() { Err(PipelineError::DeadlineExceeded { stage }) } else { Ok(()) }
 }

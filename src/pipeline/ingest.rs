@@ -1,6 +1,7 @@
 //! Image and metadata to a durable, searchable reference.
 
 use super::blocking::blocking;
+use super::extraction::Purpose;
 use super::{PipelineError, Service, Timings};
 use crate::error::ErrorCode;
 use crate::ops::Stage;
@@ -10,7 +11,7 @@ use crate::store::Inserted;
 use crate::types::{ContentHash, InvalidValue, MapName, NewReference, Reference, ReferenceFields};
 use bytes::Bytes;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// A reference to be taken in.
 #[derive(Debug, Clone)]
@@ -50,9 +51,9 @@ impl Service {
         if let Some(reference) = self.known(&request, content_hash).await? {
             return Ok(IngestAnswer { reference, created: false, timings: Timings::default() });
         }
-        let _ticket = self.admission.enter()?;
+        let _ticket = self.references.enter(Duration::MAX)?;
         let mut timings = Timings::default();
-        let descriptor = self.extraction.describe(request.image, None, &mut timings).await?;
+        let descriptor = self.extraction.describe(request.image, Purpose::Ingest, &mut timings).await?;
         let new = NewReference { map: request.map, fields: request.fields, content_hash, model, descriptor };
         let (service, started) = (self.clone(), Instant::now());
         let committed = blocking(move || service.commit(new)).await;

@@ -6,7 +6,7 @@
 
 use super::PipelineError;
 use crate::search::MapIndex;
-use crate::types::{MapName, ModelId};
+use crate::types::{Calibration, MapName, ModelId};
 use std::collections::HashMap;
 use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
@@ -24,6 +24,7 @@ pub(super) struct MapEntry {
 pub(super) struct LiveMap {
     pub(super) model: ModelId,
     pub(super) index: MapIndex,
+    calibration: RwLock<Option<Arc<Calibration>>>,
 }
 
 impl Maps {
@@ -73,7 +74,7 @@ impl MapEntry {
         if let Some(live) = self.live() {
             return live;
         }
-        let fresh = || Arc::new(LiveMap { model: model.clone(), index: MapIndex::default() });
+        let fresh = || Arc::new(LiveMap::new(model.clone(), MapIndex::default(), None));
         write(&self.live).get_or_insert_with(fresh).clone()
     }
 
@@ -87,6 +88,19 @@ impl MapEntry {
 }
 
 impl LiveMap {
+    pub(super) fn new(model: ModelId, index: MapIndex, calibration: Option<Calibration>) -> Self {
+        Self { model, index, calibration: RwLock::new(calibration.map(Arc::new)) }
+    }
+
+    /// How far its best answers can be trusted, if that was fitted for this map.
+    pub(super) fn calibration(&self) -> Option<Arc<Calibration>> {
+        read(&self.calibration).clone()
+    }
+
+    pub(super) fn calibrate(&self, calibration: Option<Calibration>) {
+        *write(&self.calibration) = calibration.map(Arc::new);
+    }
+
     pub(super) fn check_model(&self, name: &MapName, model: &ModelId) -> Result<(), PipelineError> {
         if self.model == *model {
             return Ok(());

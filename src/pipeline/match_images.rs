@@ -1,6 +1,7 @@
 //! Two images, or an image and a reference, matched with the evidence kept.
 
 use super::blocking::blocking;
+use super::extraction::Purpose;
 use super::{PipelineError, Service, Timings};
 use crate::ops::Stage;
 use crate::rerank::CombinationMatch;
@@ -57,13 +58,13 @@ impl Service {
             MatchSide::Reference(id) => Side::Patches(self.stored_patches(id).await?),
             MatchSide::Image(bytes) => Side::Image(bytes),
         };
-        let _ticket = self.admission.enter()?;
-        let deadline = Some(Deadline::after(Duration::from_millis(self.config.deadline_ms)));
+        let _ticket = self.queries.enter(self.patience())?;
+        let purpose = Purpose::Answer(Deadline::after(Duration::from_millis(self.config.deadline_ms)));
         let mut timings = Timings::default();
-        let query = Arc::new(self.extraction.describe(query, deadline, &mut timings).await?.patches);
+        let query = Arc::new(self.extraction.describe(query, purpose, &mut timings).await?.patches);
         let reference = match other {
             Side::Patches(patches) => patches,
-            Side::Image(bytes) => Arc::new(self.extraction.describe(bytes, deadline, &mut timings).await?.patches),
+            Side::Image(bytes) => Arc::new(self.extraction.describe(bytes, purpose, &mut timings).await?.patches),
         };
         let (service, started) = (self.clone(), Instant::now());
         let explained = blocking(move || {

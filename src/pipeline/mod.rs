@@ -24,6 +24,7 @@ mod service;
 mod source;
 mod startup;
 mod timings;
+mod trust;
 
 pub use config::PipelineConfig;
 pub use error::PipelineError;
@@ -34,3 +35,4 @@ pub use service::{Service, ServiceInfo};
 pub use source::DescriptorSource;
 pub use startup::Parts;
 pub use timings::Timings;
+pub use trust::{Verdict, built_in_calibration};

@@ -1,9 +1,9 @@
 //! A photo to ranked places: global search, then re-ranking of the candidates (paper III-A, III-D, III-E).
 
 use super::blocking::blocking;
-use super::extraction::not_passed;
+use super::extraction::{Purpose, not_passed};
 use super::maps::LiveMap;
-use super::{PipelineError, Service, Timings};
+use super::{PipelineError, Service, Timings, Verdict};
 use crate::error::ErrorCode;
 use crate::ops::Stage;
 use crate::ops::metrics::Rejection;
@@ -60,6 +60,8 @@ pub struct QueryAnswer {
     pub results: Vec<QueryResult>,
     /// Whether the order comes from re-ranking.
     pub reranked: bool,
+    /// How far the first result can be trusted.
+    pub verdict: Verdict,
     /// Where the time went.
     pub timings: Timings,
     /// What computed it.
@@ -95,11 +97,12 @@ impl Service {
 
     async fn answer(self: &Arc<Self>, request: QueryRequest) -> Result<QueryAnswer, PipelineError> {
         let plan = self.plan(&request.map, request.options)?;
-        let _ticket = self.admission.enter()?;
-        not_passed(Some(plan.deadline), "decoding")?;
+        let patience = plan.deadline.remaining().min(self.patience());
+        not_passed(plan.deadline, "decoding")?;
+        let _ticket = self.queries.enter(patience)?;
         let mut timings = Timings::default();
-        let descriptor = self.extraction.describe(request.image, Some(plan.deadline), &mut timings).await?;
-        not_passed(Some(plan.deadline), "search")?;
+        let descriptor = self.extraction.describe(request.image, Purpose::Answer(plan.deadline), &mut timings).await?;
+        not_passed(plan.deadline, "search")?;
         let service = self.clone();
         let ranked = blocking(move || service.rank(&plan, &descriptor, timings)).await;
         ranked.map_err(|_| PipelineError::Panicked { stage: "ranking" })?
@@ -129,16 +132,12 @@ impl Service {
         let was_reranked = reranked.is_some();
         let placed =
             reranked.unwrap_or_else(|| neighbours.iter().map(|&neighbour| Placed { neighbour, score: None }).collect());
-        if was_reranked {
-            let top1 = placed.first().and_then(|best| best.score.as_ref()).map_or(0, |score| score.spatial_score);
-            self.metrics.query_answered(top1, top1 >= self.config.min_spatial_score);
-        }
-        Ok(QueryAnswer {
-            results: self.with_metadata(placed, plan.top_k)?,
-            reranked: was_reranked,
-            timings,
-            model: plan.map.model.clone(),
-        })
+        let results = self.with_metadata(placed, plan.top_k)?;
+        let best = results.first();
+        let verdict = self.trust.judge(plan.map.calibration().as_deref(), best);
+        let top1 = best.and_then(|best| best.score.as_ref()).map_or(0, |score| score.spatial_score);
+        self.metrics.query_answered(was_reranked.then_some(top1), verdict.matched);
+        Ok(QueryAnswer { results, reranked: was_reranked, verdict, timings, model: plan.map.model.clone() })
     }
 
     /// The candidates in their new order, followed by the neighbours beyond them; `None` if time ran out.

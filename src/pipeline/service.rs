@@ -5,14 +5,16 @@ use super::blocking::blocking;
 use super::extraction::Extraction;
 use super::maps::Maps;
 use super::patches::PatchCache;
+use super::trust::Trust;
 use super::{PipelineConfig, PipelineError};
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::metrics::MemoryComponent;
 use crate::ops::{Health, Metrics};
 use crate::rerank::{RerankConfig, Reranker};
 use crate::store::{MapInfo, Page, PlaceStore, StoreError};
-use crate::types::{ExternalId, ImageSize, MapName, ModelId, Reference, ReferenceId};
+use crate::types::{Calibration, ExternalId, ImageSize, MapName, ModelId, Reference, ReferenceId};
 use std::sync::Arc;
+use std::time::Duration;
 
 /// A running service. Shared behind an `Arc`; every method may be called from many tasks at once.
 pub struct Service {
@@ -22,7 +24,11 @@ pub struct Service {
     pub(super) rerank_config: RerankConfig,
     pub(super) maps: Maps,
     pub(super) patches: PatchCache,
-    pub(super) admission: Arc<Admission>,
+    pub(super) trust: Trust,
+    /// The door for queries and matches.
+    pub(super) queries: Arc<Admission>,
+    /// The door for new references.
+    pub(super) references: Arc<Admission>,
     pub(super) memory: MemoryWatermark,
     pub(super) config: PipelineConfig,
     pub(super) metrics: Arc<Metrics>,
@@ -40,6 +46,8 @@ pub struct ServiceInfo {
     pub rerank: RerankConfig,
     /// Defaults and bounds of requests.
     pub pipeline: PipelineConfig,
+    /// What confidences come from on maps without a calibration of their own.
+    pub calibration: Option<Calibration>,
 }
 
 impl Service {
@@ -50,12 +58,18 @@ impl Service {
             input_size: self.extraction.source().input_size(),
             rerank: self.rerank_config.clone(),
             pipeline: self.config.clone(),
+            calibration: self.trust.built_in().cloned(),
         }
     }
 
     /// Settings of the composition.
     pub fn config(&self) -> &PipelineConfig {
         &self.config
+    }
+
+    /// How long a query may wait for its turn.
+    pub(super) fn patience(&self) -> Duration {
+        Duration::from_millis(self.config.max_wait_ms)
     }
 
     /// One reference's metadata.
@@ -107,10 +121,13 @@ impl Service {
         self.metrics.set_memory(MemoryComponent::Model, self.extraction.source().memory_bytes());
         self.metrics
             .set_references(maps.iter().map(|(name, live)| (name.to_string(), live.index.len() as u64)).collect());
-        self.metrics.set_queue_depth(self.admission.depth());
         match self.read(|store| store.footprint()).await {
             Ok((_, engine)) => self.metrics.set_memory(MemoryComponent::Sqlite, engine),
             Err(error) => tracing::warn!(%error, "the store's footprint could not be read"),
+        }
+        match self.read(|store| store.quarantined()).await {
+            Ok(records) => self.metrics.set_quarantined(records.len()),
+            Err(error) => tracing::warn!(%error, "the quarantine could not be read"),
         }
     }
 

@@ -12,9 +12,7 @@ pub trait DescriptorSource: Send + Sync + 'static {
     /// One descriptor per image. Blocks for the whole computation.
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError>;
     /// Bytes of weights in memory.
-    fn memory_bytes(&self) -> u64 {
-        0
-    }
+    fn memory_bytes(&self) -> u64;
 }
 
 impl DescriptorSource for Extractor {
@@ -28,5 +26,9 @@ impl DescriptorSource for Extractor {
 
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
         self.extract(images)
+    }
+
+    fn memory_bytes(&self) -> u64 {
+        self.weight_bytes() as u64
     }
 }

@@ -4,6 +4,7 @@ use super::admission::Admission;
 use super::extraction::Extraction;
 use super::maps::{LiveMap, MapEntry, Maps};
 use super::patches::PatchCache;
+use super::trust::Trust;
 use super::{DescriptorSource, PipelineConfig, PipelineError, Service};
 use crate::image::ImageConfig;
 use crate::ops::memory::MemoryWatermark;
@@ -39,21 +40,26 @@ impl Service {
     /// Builds the indexes and opens for requests. Blocks until all maps can be searched.
     pub fn start(parts: Parts) -> Result<Arc<Self>, PipelineError> {
         parts.pipeline.check()?;
+        let trust = Trust::new(parts.source.model_id(), parts.rerank.id());
         let maps = build_indexes(&*parts.store, &*parts.source, &parts.health)?;
+        for (name, live) in maps.all() {
+            trust.warn_if_useless(&name, live.calibration().as_deref());
+        }
         let service = Arc::new(Self {
+            trust,
             extraction: Extraction::new(parts.source, parts.image, parts.metrics.clone()),
             reranker: Reranker::new(parts.rerank.clone()),
             rerank_config: parts.rerank,
             maps,
             patches: PatchCache::new(parts.pipeline.patch_cache_bytes, parts.metrics.clone()),
-            admission: Admission::new(parts.pipeline.queue_capacity, parts.metrics.clone()),
+            queries: Admission::new(parts.pipeline.queue_capacity, parts.metrics.clone()),
+            references: Admission::new(parts.pipeline.queue_capacity, parts.metrics.clone()),
             memory: MemoryWatermark::new(parts.pipeline.memory_watermark_bytes),
             config: parts.pipeline,
             store: parts.store,
             metrics: parts.metrics,
-            health: parts.health.clone(),
+            health: parts.health,
         });
-        parts.health.serving();
         Ok(service)
     }
 }
@@ -80,7 +86,7 @@ fn build_index(
     if model != *source.model_id() {
         tracing::warn!(map = %info.name, map_model = %model, server_model = %source.model_id(),
             "this map was built with another model: it can be read and deleted, but not searched");
-        entry.put(LiveMap { model, index: MapIndex::default() });
+        entry.put(LiveMap::new(model, MapIndex::default(), info.calibration.clone()));
         return Ok(());
     }
     let mut entries = Vec::with_capacity(info.references as usize);
@@ -97,6 +103,6 @@ fn build_index(
     })?;
     health.indexed(entries.len() as u64 % PROGRESS_STEP);
     tracing::info!(map = %info.name, references = entries.len(), "indexed");
-    entry.put(LiveMap { model, index: MapIndex::build(entries) });
+    entry.put(LiveMap::new(model, MapIndex::build(entries), info.calibration.clone()));
     Ok(())
 }

@@ -17,7 +17,7 @@ mod score;
 mod tests;
 
 use crate::kernels::simd::{self, Simd};
-use crate::types::{Deadline, PackedPatches, ScaleSet};
+use crate::types::{Deadline, PackedPatches, RerankId, ScaleSet};
 use mutual_nn::PreparedQuery;
 use rayon::prelude::*;
 use score::{with_prepared, with_workspace};
@@ -40,6 +40,15 @@ pub struct RerankConfig {
 impl Default for RerankConfig {
     fn default() -> Self {
         Self { scales: ScaleSet::paper_default(), tolerance_patches: 1.5, max_iterations: 2000, confidence: 0.995 }
+    }
+}
+
+impl RerankConfig {
+    /// Everything that S depends on beyond the descriptors: `1,1+2,2+3:t1.5:i2000:c0.995`.
+    pub fn id(&self) -> RerankId {
+        let scales: Vec<String> = self.scales.iter().map(ToString::to_string).collect();
+        let Self { tolerance_patches, max_iterations, confidence, .. } = self;
+        RerankId::new(format!("{}:t{tolerance_patches}:i{max_iterations}:c{confidence}", scales.join(",")))
     }
 }
 

@@ -43,6 +43,16 @@ pub enum StoreError {
         /// The model of the descriptor offered.
         given: ModelId,
     },
+    /// The calibration was fitted for another model than the map's.
+    #[error("map {map} is bound to model {bound}; the calibration was fitted for model {given}")]
+    CalibrationMismatch {
+        /// The map.
+        map: MapName,
+        /// The model all its descriptors come from.
+        bound: ModelId,
+        /// The model of the calibration offered.
+        given: ModelId,
+    },
     /// A reference fails its checksum; it is quarantined.
     #[error("reference {id} is damaged on disk and quarantined: {reason}; delete it or send its image again")]
     Corrupt {
@@ -137,6 +147,7 @@ impl StoreError {
             Self::ReferenceNotFound { .. } => ErrorCode::ReferenceNotFound,
             Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
             Self::ModelMismatch { .. } => ErrorCode::ModelMismatch,
+            Self::CalibrationMismatch { .. } => ErrorCode::CalibrationMismatch,
             Self::Corrupt { .. } | Self::CorruptMap { .. } => ErrorCode::CorruptRecord,
             Self::DiskFull => ErrorCode::DiskFull,
             Self::Busy { .. } | Self::ReheadInProgress { .. } => ErrorCode::Overloaded,

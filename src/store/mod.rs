@@ -14,7 +14,7 @@ pub use error::{EngineCause, StoreError};
 pub use sqlite::SqliteStore;
 
 use crate::types::{
-    ExternalId, MapName, ModelId, NewReference, PackedPatches, Reference, ReferenceFields, ReferenceId,
+    Calibration, ExternalId, MapName, ModelId, NewReference, PackedPatches, Reference, ReferenceFields, ReferenceId,
 };
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -71,6 +71,8 @@ pub struct MapInfo {
     pub references: u64,
     /// When it was created.
     pub created_at: OffsetDateTime,
+    /// How far its best answers can be trusted, if that was fitted for this map.
+    pub calibration: Option<Calibration>,
 }
 
 /// A stored reference as the index needs it.
@@ -168,7 +170,7 @@ pub trait PlaceStore: Send + Sync {
     /// Every global descriptor of a map, to rebuild its index.
     fn scan_globals(&self, map: &MapName, visit: &mut dyn FnMut(GlobalRow)) -> Result<(), StoreError>;
     /// Gives a map another head: `compute` makes the new global vector from each pooled vector (`[dim]`, unit length
-    /// to half precision). Atomic: all references change to `new_model` or none. Reads and writes go on meanwhile;
+    /// to half precision; the caller answers for its fitting the new head). Atomic: all references change to `new_model` or none. Reads and writes go on meanwhile;
     /// the map's calibration is cleared. An index of the map must be rebuilt afterwards.
     fn replace_globals(
         &self,
@@ -176,10 +178,8 @@ pub trait PlaceStore: Send + Sync {
         new_model: ModelId,
         compute: &mut dyn FnMut(&[f32]) -> Vec<f32>,
     ) -> Result<(), StoreError>;
-    /// The map's calibration, if it was given one.
-    fn calibration(&self, map: &MapName) -> Result<Option<serde_json::Value>, StoreError>;
-    /// Stores or clears the map's calibration.
-    fn set_calibration(&self, map: &MapName, calibration: Option<serde_json::Value>) -> Result<(), StoreError>;
+    /// Stores the map's calibration, which must have been fitted for its model, or clears it.
+    fn set_calibration(&self, map: &MapName, calibration: Option<Calibration>) -> Result<(), StoreError>;
     /// References known to be damaged. They are not served; deleting them or sending their image again ends it.
     fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError>;
     /// Writes a consistent copy of everything to a new file while the store is in use; returns its size in bytes.

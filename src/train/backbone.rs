@@ -5,11 +5,12 @@
 //! through them.
 
 use super::augment::augment;
+use super::config::TrainConfig;
 use super::loss::normalise_rows;
-use super::trainer::{Sample, Session, TrainConfig, TripletModel, run};
+use super::trainer::{Sample, Session, TripletModel, run};
 use super::triplets::TripletSet;
 use super::{Augmentation, Outcome, TrainError};
-use crate::extract::{EncoderSpec, Head, LAYER_NORM_EPS, VitWeights, interpolate_positions};
+use crate::extract::{Aggregate, EncoderSpec, Head, LAYER_NORM_EPS, VitWeights, interpolate_positions};
 use crate::image::{ImageConfig, load_tensor};
 use crate::types::{GLOBAL_DIM, ImageTensor};
 use candle_core::{D, Device, Tensor, Var};
@@ -119,7 +120,7 @@ impl BackboneModel {
         }
         trained.save(weights)?;
         let flat = |name: &str| Ok::<_, TrainError>(self.tensor(name)?.flatten_all()?.to_vec1::<f32>()?);
-        Ok(Head::new(flat(HEAD_WEIGHT)?, flat(HEAD_BIAS)?, backbone()?, notes)?.save(head)?)
+        Ok(Head::new(Aggregate::Mean, flat(HEAD_WEIGHT)?, flat(HEAD_BIAS)?, backbone()?, notes)?.save(head)?)
     }
 
     fn tensor(&self, name: &str) -> Result<&Tensor> {

@@ -5,12 +5,12 @@
 
 use super::TrainError;
 use super::adam::Adam;
-use super::trainer::{TrainConfig, ValidationRecall};
+use super::config::{TrainConfig, ValidationRecall};
+use crate::extract::write_atomically;
 use candle_core::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
-use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 const FILE: &str = "checkpoint.safetensors";
 const STATE: &str = "placeformer.train";
@@ -34,6 +34,7 @@ struct State {
     best: ValidationRecall,
     last_loss: f32,
     config: TrainConfig,
+    identity: String,
 }
 
 impl Checkpoint {
@@ -74,7 +75,12 @@ impl Checkpoint {
     }
 
     /// Continues the run in `folder`, if there is one: fills the optimiser and the model's weights.
-    pub(super) fn resume(folder: &Path, config: &TrainConfig, adam: &mut Adam) -> Result<Option<Self>, TrainError> {
+    pub(super) fn resume(
+        folder: &Path,
+        config: &TrainConfig,
+        identity: &str,
+        adam: &mut Adam,
+    ) -> Result<Option<Self>, TrainError> {
         let path = folder.join(FILE);
         let bytes = match std::fs::read(&path) {
             Ok(bytes) => bytes,
@@ -89,6 +95,10 @@ impl Checkpoint {
         let state: State = serde_json::from_str(state).map_err(|error| wrong(format!("its header: {error}")))?;
         if state.config != *config {
             return Err(wrong("it belongs to a run with other settings; use them again or another folder".into()));
+        }
+        if state.identity != identity {
+            let reason = "it belongs to a run on other data or from other weights; use these again or another folder";
+            return Err(wrong(reason.into()));
         }
         let mut tensors = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)?;
         let mut take = |prefix: &str, name: &str, shape: &candle_core::Shape| {
@@ -114,7 +124,13 @@ impl Checkpoint {
     }
 
     /// Replaces the checkpoint in `folder`.
-    pub(super) fn save(&self, folder: &Path, config: &TrainConfig, adam: &Adam) -> Result<(), TrainError> {
+    pub(super) fn save(
+        &self,
+        folder: &Path,
+        config: &TrainConfig,
+        identity: &str,
+        adam: &Adam,
+    ) -> Result<(), TrainError> {
         let mut tensors: HashMap<String, Tensor> = HashMap::new();
         for slot in &adam.slots {
             tensors.insert(format!("weights.{}", slot.name), slot.variable.as_tensor().clone());
@@ -131,25 +147,18 @@ impl Checkpoint {
             best: self.best,
             last_loss: self.last_loss,
             config: config.clone(),
+            identity: identity.to_owned(),
         };
         let path = folder.join(FILE);
         let state = serde_json::to_string(&state)
             .map_err(|error| TrainError::Checkpoint { path: path.clone(), reason: error.to_string() })?;
         let bytes = safetensors::serialize(&tensors, Some(HashMap::from([(STATE.to_owned(), state)])))
             .map_err(|error| TrainError::Checkpoint { path: path.clone(), reason: error.to_string() })?;
-        write_atomically(&path, &bytes).map_err(|source| TrainError::Io { path, source })
+        Ok(write_atomically(&path, &bytes)?)
     }
 }
 
 fn weights_of(adam: &Adam) -> Result<HashMap<String, Tensor>, TrainError> {
     // Copied: `Var::set` writes in place, so a shared tensor would follow the training.
     adam.slots.iter().map(|slot| Ok((slot.name.clone(), slot.variable.as_tensor().copy()?))).collect()
-}
-
-fn write_atomically(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    let beside: PathBuf = path.with_extension("part");
-    let mut file = std::fs::File::create(&beside)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    std::fs::rename(&beside, path)
 }

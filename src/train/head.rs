@@ -1,7 +1,8 @@
 //! Training the head alone: images are encoded once, so that a step costs a matrix product.
 
+use super::config::TrainConfig;
 use super::loss::normalise_rows;
-use super::trainer::{Sample, Session, TrainConfig, TripletModel, run};
+use super::trainer::{Sample, Session, TripletModel, run};
 use super::triplets::{Side, TripletSet};
 use super::{Outcome, TrainError};
 use candle_core::{Device, Tensor, Var};

@@ -15,30 +15,40 @@
 //! | module | holds |
 //! |---|---|
 //! | `triplets` | which images are positives, which may be negatives |
+//! | `holdout` | which places are kept back for validation |
 //! | `mining` | the negatives that look most like the query |
 //! | `loss`, `adam`, `schedule` | one step |
 //! | `head`, `backbone` | the two things that can be trained |
+//! | `pooled_cache` | what a head is trained on, kept on disk |
 //! | `augment` | photometric and geometric variation of training images |
-//! | `trainer`, `checkpoint`, `log` | the loop, its memory and its diary |
+//! | `trainer`, `config`, `checkpoint`, `log` | the loop, its settings, its memory and its diary |
+//! | [`report`] | the run as a page |
 
 mod adam;
 mod augment;
 mod backbone;
 mod checkpoint;
+mod config;
 mod error;
 mod head;
+mod holdout;
 mod log;
 mod loss;
 mod mining;
+mod pooled_cache;
+pub mod report;
 mod schedule;
 mod trainer;
 mod triplets;
 
 pub use augment::{Augmentation, augment};
 pub use backbone::{BackboneModel, TrainableBlocks};
+pub use config::{TrainConfig, ValidationRecall};
 pub use error::TrainError;
 pub use head::{HeadModel, PooledTokens};
+pub use holdout::{Drives, Holdout};
 pub use log::{CycleRecord, read_log};
+pub use pooled_cache::PooledCache;
 pub use schedule::Schedule;
-pub use trainer::{Outcome, Session, TrainConfig, ValidationRecall};
+pub use trainer::{Outcome, Session};
 pub use triplets::{Side, TripletSet};

@@ -1,81 +1,20 @@
 //! The loop: mine, step, validate, keep the best, checkpoint; stop when validation no longer improves.
 
+use super::TrainError;
 use super::adam::Adam;
 use super::checkpoint::Checkpoint;
+use super::config::{TrainConfig, ValidationRecall};
 use super::log::{CycleRecord, TrainLog};
 use super::loss::triplet_margin_loss;
 use super::mining::{Embeddings, hardest_negatives, row, squared_distance};
-use super::schedule::Schedule;
 use super::triplets::{Side, TripletSet};
-use super::{Augmentation, TrainError};
 use candle_core::{Tensor, Var};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use std::path::PathBuf;
 use std::time::Instant;
-
-/// Settings of a run (paper III-F and IV-B where a number is given there).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct TrainConfig {
-    /// Margin m of the loss.
-    pub margin: f64,
-    /// Learning rate over the run.
-    pub schedule: Schedule,
-    /// Triplets per step.
-    pub batch: usize,
-    /// Steps between two minings; also between validations and checkpoints.
-    pub steps_per_cycle: u64,
-    /// Hard negatives kept for each query, one of which is drawn.
-    pub negatives: usize,
-    /// Most database images compared when mining.
-    pub mining_pool: usize,
-    /// Cycles without a better validation recall after which the run stops.
-    pub patience: u32,
-    /// Variation of the training images.
-    pub augmentation: Augmentation,
-    /// Where every random choice comes from.
-    pub seed: u64,
-}
-
-impl Default for TrainConfig {
-    fn default() -> Self {
-        Self {
-            margin: 0.01,
-            schedule: Schedule::default(),
-            batch: 16,
-            steps_per_cycle: 100,
-            negatives: 10,
-            mining_pool: 20_000,
-            patience: 8,
-            augmentation: Augmentation::default(),
-            seed: 0,
-        }
-    }
-}
-
-impl TrainConfig {
-    fn check(&self) -> Result<(), TrainError> {
-        self.schedule.check()?;
-        self.augmentation.check()?;
-        let positive = [
-            ("batch", self.batch as u64),
-            ("steps per cycle", self.steps_per_cycle),
-            ("negatives", self.negatives as u64),
-            ("mining pool", self.mining_pool as u64),
-            ("patience", u64::from(self.patience)),
-        ];
-        if let Some((name, _)) = positive.iter().find(|(_, value)| *value == 0) {
-            return Err(TrainError::Setting(format!("{name} must be at least 1")));
-        }
-        if !(self.margin.is_finite() && self.margin >= 0.0) {
-            return Err(TrainError::Setting(format!("the margin must not be negative, and is {}", self.margin)));
-        }
-        Ok(())
-    }
-}
 
 /// An image to embed: which one, and under which variation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -94,24 +33,6 @@ pub(super) trait TripletModel {
     fn embed(&self, set: &TripletSet, samples: &[Sample]) -> Result<Tensor, TrainError>;
     /// How many images to embed at once outside the graph.
     fn embed_batch(&self) -> usize;
-}
-
-/// Recall of the current weights on held-out places, in percent, given descriptors of both sides.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct ValidationRecall {
-    /// Recall@1.
-    pub at_1: f64,
-    /// Recall@5.
-    pub at_5: f64,
-    /// Recall@10.
-    pub at_10: f64,
-}
-
-impl ValidationRecall {
-    /// What early stopping watches: the mean of R@1 and R@10.
-    pub fn criterion(&self) -> f64 {
-        (self.at_1 + self.at_10) / 2.0
-    }
 }
 
 /// How a run ended.
@@ -133,6 +54,8 @@ pub struct Outcome {
 pub struct Session<'a> {
     /// Folder of the checkpoint and the log; an existing checkpoint is continued.
     pub folder: PathBuf,
+    /// What the run depends on besides its settings: data, starting weights. A checkpoint of another is refused.
+    pub identity: String,
     /// Called after every cycle.
     pub progress: &'a mut dyn FnMut(&CycleRecord),
 }
@@ -147,7 +70,7 @@ pub(super) fn run(
 ) -> Result<Outcome, TrainError> {
     config.check()?;
     let mut adam = Adam::new(model.variables())?;
-    let mut checkpoint = match Checkpoint::resume(&session.folder, config, &mut adam)? {
+    let mut checkpoint = match Checkpoint::resume(&session.folder, config, &session.identity, &mut adam)? {
         Some(checkpoint) => checkpoint,
         None => Checkpoint::start(&adam, validate(model, validation)?)?,
     };
@@ -159,7 +82,7 @@ pub(super) fn run(
         let loss = cycle(model, training, &usable, config, &mut adam, checkpoint.steps..until)?;
         let recall = validate(model, validation)?;
         checkpoint.record(&adam, until, loss, recall)?;
-        checkpoint.save(&session.folder, config, &adam)?;
+        checkpoint.save(&session.folder, config, &session.identity, &adam)?;
         let record = CycleRecord {
             step: until,
             learning_rate: config.schedule.rate(until - 1),

@@ -1,7 +1,8 @@
 //! Which images show a query's place, and which may serve as its negatives (paper III-F: 10 m and 25 m).
 
 use super::TrainError;
-use crate::eval::datasets::{Dataset, MetricPoint, NeighbourGrid};
+use crate::eval::datasets::{Dataset, Item, MetricPoint, NeighbourGrid};
+use crate::types::ContentHash;
 use std::path::PathBuf;
 
 /// One side of a triplet.
@@ -36,24 +37,21 @@ impl TripletSet {
                 "positives within {positive_m} m and negatives beyond {negative_m} m leave no order between them"
             )));
         }
-        let located = |items: &[crate::eval::datasets::Item]| -> Vec<(PathBuf, MetricPoint)> {
-            items.iter().filter_map(|item| Some((item.path.clone(), item.position?))).collect()
-        };
         let (queries, database) = (located(&dataset.queries), located(&dataset.database));
-        let grid = |radius| NeighbourGrid::new(radius, database.iter().map(|item| item.1).enumerate());
-        let (positive_grid, near_grid) = (grid(positive_m), grid(negative_m));
-        let within = |grid: &NeighbourGrid, point| {
-            let mut found: Vec<u32> = grid.within(point).map(|index| index as u32).collect();
-            found.sort_unstable();
-            found
+        let near_of = |radius: f64| -> Vec<Vec<u32>> {
+            let grid = NeighbourGrid::new(radius, database.iter().map(|item| item.1).enumerate());
+            let around = |(query, point): &(&Item, MetricPoint)| {
+                // Coordinates of two cities may coincide.
+                let same_city = |&index: &usize| database[index].0.group == query.group;
+                let mut found: Vec<u32> = grid.within(*point).filter(same_city).map(|index| index as u32).collect();
+                found.sort_unstable();
+                found
+            };
+            queries.iter().map(around).collect()
         };
-        Self {
-            positives: queries.iter().map(|item| within(&positive_grid, item.1)).collect(),
-            near: queries.iter().map(|item| within(&near_grid, item.1)).collect(),
-            queries: queries.into_iter().map(|item| item.0).collect(),
-            database: database.into_iter().map(|item| item.0).collect(),
-        }
-        .checked()
+        let (positives, near) = (near_of(positive_m), near_of(negative_m));
+        let paths = |items: &[(&Item, MetricPoint)]| items.iter().map(|item| item.0.path.clone()).collect();
+        Self { queries: paths(&queries), database: paths(&database), positives, near }.checked()
     }
 
     /// Relations by order, for drives whose frames carry no position: a frame's neighbours up to `positive_frames`
@@ -86,6 +84,38 @@ impl TripletSet {
         Self { queries: images.clone(), database: images, positives, near }.checked()
     }
 
+    /// All `sets` as one. Images of different sets are taken to show different places, so sets of one area must be
+    /// read as one instead.
+    ///
+    /// # Errors
+    /// There is no set.
+    pub fn merge(sets: Vec<Self>) -> Result<Self, TrainError> {
+        let mut all = Self { queries: vec![], database: vec![], positives: vec![], near: vec![] };
+        for set in sets {
+            let first = all.database.len() as u32;
+            let shift = |rows: Vec<Vec<u32>>| rows.into_iter().map(move |row| row.iter().map(|i| first + i).collect());
+            all.positives.extend(shift(set.positives));
+            all.near.extend(shift(set.near));
+            all.queries.extend(set.queries);
+            all.database.extend(set.database);
+        }
+        all.checked()
+    }
+
+    /// SHA-256 over images and relations, hexadecimal: two runs with the same one learn from the same data.
+    pub fn fingerprint(&self) -> String {
+        let mut bytes = Vec::new();
+        for paths in [&self.queries, &self.database] {
+            bytes.extend((paths.len() as u64).to_le_bytes());
+            paths.iter().for_each(|path| bytes.extend(path.as_os_str().as_encoded_bytes().iter().chain(&[0])));
+        }
+        for row in self.positives.iter().chain(&self.near) {
+            bytes.extend((row.len() as u32).to_le_bytes());
+            row.iter().for_each(|index| bytes.extend(index.to_le_bytes()));
+        }
+        ContentHash::of(&bytes).to_string()
+    }
+
     /// The queries that have a positive and at least one possible negative.
     pub fn usable(&self) -> impl Iterator<Item = usize> + '_ {
         (0..self.queries.len())
@@ -112,10 +142,14 @@ impl TripletSet {
     }
 }
 
+fn located(items: &[Item]) -> Vec<(&Item, MetricPoint)> {
+    items.iter().filter_map(|item| Some((item, item.position?))).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::eval::datasets::{Item, Truth};
+    use crate::eval::datasets::Truth;
 
     fn at(name: &str, east: f64) -> Item {
         Item { position: Some(MetricPoint { east, north: 0.0 }), ..Item::new(name, name) }
@@ -139,6 +173,25 @@ mod tests {
         let database = vec![Item::new("lost", "lost"), at("far", 1000.0)];
         let error = TripletSet::by_position(&dataset(database, vec![at("q", 0.0)]), 10.0, 25.0).unwrap_err();
         assert!(matches!(error, TrainError::NoTriplets(_)), "{error}");
+    }
+
+    #[test]
+    fn another_city_is_never_near_whatever_its_coordinates() {
+        let city = |item: Item, name: &str| Item { group: Some(name.into()), ..item };
+        let database = vec![city(at("a", 0.0), "x"), city(at("b", 0.0), "y")];
+        let set = TripletSet::by_position(&dataset(database, vec![city(at("q", 1.0), "y")]), 10.0, 25.0).unwrap();
+        assert_eq!((&set.positives, &set.near), (&vec![vec![1]], &vec![vec![1]]));
+    }
+
+    #[test]
+    fn merged_sets_keep_their_relations_and_are_negatives_of_each_other() {
+        let drive = |name: &str| (0..5).map(|i| PathBuf::from(format!("{name}/{i}"))).collect::<Vec<_>>();
+        let set = |name: &str| TripletSet::by_order(&[drive(name)], 1, 2).unwrap();
+        let merged = TripletSet::merge(vec![set("a"), set("b")]).unwrap();
+        assert_eq!(merged, TripletSet::by_order(&[drive("a"), drive("b")], 1, 2).unwrap());
+        assert_eq!(merged.fingerprint(), merged.clone().fingerprint());
+        assert_ne!(merged.fingerprint(), set("a").fingerprint());
+        assert!(TripletSet::merge(vec![]).is_err());
     }
 
     #[test]

@@ -205,7 +205,8 @@ impl PackedPatches {
 pub struct Descriptor {
     /// L2-normalised global descriptor, `[256]`: searched.
     pub global: Vec<f32>,
-    /// Mean patch token before the head, L2-normalised, `[dim]`: kept so that a map can be given a new head.
+    /// Pooled patch tokens before the head, L2-normalised, `[dim]` of the head's aggregate (the mean token, unless the
+    /// head says otherwise): kept so that a map can be given a new head of the same aggregate.
     pub pooled: Vec<f32>,
     /// Key patches: re-ranked.
     pub patches: PackedPatches,

@@ -179,6 +179,31 @@ impl fmt::Display for ModelId {
     }
 }
 
+/// What S depends on beyond the descriptors: the settings of re-ranking as one printable string.
+///
+/// Scores compare meaningfully only if their `RerankId`s are equal.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct RerankId(String);
+
+impl RerankId {
+    /// Wraps the text that `rerank` composed or a calibration kept.
+    pub fn new(text: impl Into<String>) -> Self {
+        Self(text.into())
+    }
+
+    /// The identity as text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for RerankId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
 /// SHA-256 of an image's bytes as they were sent: decides whether a repeated `external_id` is the same content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ContentHash(pub [u8; 32]);

@@ -1,18 +1,20 @@
 //! The nouns every stage shares. No I/O, no policy: only values that are valid by construction.
 
+mod calibration;
 mod deadline;
 mod descriptor;
 mod geo;
 mod ids;
 mod reference;
 
+pub use calibration::{Calibration, ConfidenceCurve, ConfidenceWeights};
 pub use deadline::Deadline;
 pub use descriptor::{
     Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, PackedPatches, PatchGrid, PoolingStride, SCALES,
     ScaleKeyPatches, ScaleSet,
 };
 pub use geo::{GeoCircle, GeoPoint, Heading};
-pub use ids::{ContentHash, ExternalId, InvalidName, MapName, ModelId, ReferenceId};
+pub use ids::{ContentHash, ExternalId, InvalidName, MapName, ModelId, ReferenceId, RerankId};
 pub use reference::{NewReference, Reference, ReferenceFields, ReferenceFilter};
 
 /// A value that breaks a type's own rule, with the rule in its message.

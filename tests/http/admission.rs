@@ -80,6 +80,58 @@ async fn a_full_queue_refuses_at_once_and_recovers() {
     app.post_png("/query?map=m", 1).await.ok();
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_query_overtakes_a_bulk_import() {
+    let app = Arc::new(App::new());
+    app.post_png("/references?map=m", 100).await.created();
+    app.source.slow_down(Duration::from_millis(200));
+    let references: Vec<_> = (0..8u64)
+        .map(|seed| {
+            let app = app.clone();
+            tokio::spawn(async move { app.post_png("/references?map=m", seed).await })
+        })
+        .collect();
+    while app.source.described() < 3 {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    app.post_png("/query?map=m", 1).await.ok();
+    let described = app.source.described();
+    assert!(described <= 5, "{described} images were described before the answer to a query sent after the third");
+    for reference in references {
+        reference.await.unwrap().created();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nobody_waits_longer_than_allowed() {
+    let app = Arc::new(App::with(|config| config.pipeline.max_wait_ms = 350));
+    app.post_png("/references?map=m", 0).await.created();
+    app.source.slow_down(Duration::from_millis(200));
+    app.post_png("/query?map=m", 1).await.ok();
+    let queries: Vec<_> = (0..12u64)
+        .map(|seed| {
+            let app = app.clone();
+            tokio::spawn(async move { app.post_png("/query?map=m", seed).await })
+        })
+        .collect();
+    let (mut answered, mut refused) = (0, 0);
+    for query in queries {
+        let answer = query.await.unwrap();
+        match answer.status.as_u16() {
+            200 => answered += 1,
+            _ => {
+                answer.problem("overloaded");
+                assert!(answer.header("retry-after").parse::<u64>().unwrap() >= 1);
+                refused += 1;
+            }
+        }
+    }
+    // A turn every 200 ms: the third would come after 400.
+    assert!((1..=3).contains(&answered), "{answered} answered, {refused} refused");
+    let metrics = app.get("/metrics").await.text;
+    assert!(metrics.contains("placeformer_queue_depth 0"), "{metrics}");
+}
+
 #[tokio::test]
 async fn the_deadline_decides_between_reranked_global_and_none() {
     let app = App::with(|config| config.pipeline.answer_reserve_ms = 60_000);
@@ -89,7 +141,9 @@ async fn the_deadline_decides_between_reranked_global_and_none() {
     assert_eq!(global.ok()["reranked"], false);
     assert_eq!(global.json["results"].as_array().unwrap().len(), 1);
     app.source.slow_down(Duration::from_millis(80));
-    app.post_png("/query?map=m&deadline_ms=20", 1).await.problem("deadline_exceeded");
+    let late = app.post_png("/query?map=m&deadline_ms=20", 1).await;
+    late.problem("deadline_exceeded");
+    assert_eq!(late.header("retry-after"), "1");
     let metrics = app.get("/metrics").await.text;
     assert!(metrics.contains("placeformer_rejected_total{reason=\"deadline\"} 1"), "{metrics}");
 }

@@ -1,9 +1,15 @@
 //! The service through its HTTP surface, with a real store and descriptors that need no weights.
 
+#[path = "../common/small_disk.rs"]
+mod small_disk;
 #[path = "../support/mod.rs"]
 mod support;
 
 mod admission;
+mod calibration;
 mod connection;
+mod disk;
 mod errors;
+mod killed;
+mod process;
 mod surface;

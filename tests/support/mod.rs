@@ -67,6 +67,10 @@ impl DescriptorSource for FakeSource {
         std::thread::sleep(delay);
         Ok(images.iter().map(describe).collect())
     }
+
+    fn memory_bytes(&self) -> u64 {
+        0
+    }
 }
 
 fn describe(image: &ImageTensor) -> Descriptor {

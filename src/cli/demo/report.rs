@@ -1,6 +1,7 @@
 //! What the demo showed: a table on the terminal, a page with pictures.
 
 use crate::draw::{jpeg_data_uri, thumbnail};
+use crate::eval::datasets::UtmName;
 use crate::eval::report::{escape, page, table};
 use crate::image::{ImageConfig, decode};
 use anyhow::Context;
@@ -23,6 +24,8 @@ pub(super) struct Asked {
     mapped: bool,
     /// In the server's order.
     pub(super) results: Vec<Found>,
+    /// Whether the server trusts its best answer, and how sure it is.
+    trust: Option<(bool, f64)>,
     /// Milliseconds per stage.
     stages: BTreeMap<String, f64>,
 }
@@ -47,7 +50,8 @@ impl Asked {
         let results = answer["results"].as_array()?.iter().map(found).collect::<Option<_>>()?;
         let stages = answer["timings_ms"].as_object()?.iter();
         let stages = stages.map(|(stage, ms)| Some((stage.clone(), ms.as_f64()?))).collect::<Option<_>>()?;
-        Some(Self { query: query.into(), mapped: !right.is_empty(), results, stages })
+        let trust = answer["matched"].as_bool().zip(answer["confidence"].as_f64());
+        Some(Self { query: query.into(), mapped: !right.is_empty(), results, trust, stages })
     }
 
     /// The answer without re-ranking.
@@ -73,6 +77,13 @@ impl Asked {
         self.results.first().map_or(0, |best| best.score)
     }
 
+    /// `97%`, with a question mark where the server does not trust it.
+    fn confidence(&self) -> String {
+        self.trust.map_or("-".into(), |(matched, confidence)| {
+            format!("{:.0}%{}", 100.0 * confidence, if matched { "" } else { "?" })
+        })
+    }
+
     fn verdict(&self) -> &'static str {
         match (self.mapped, self.right(), self.globally_right()) {
             (false, ..) => "not in the map",
@@ -86,16 +97,17 @@ impl Asked {
 /// A line per query.
 pub(super) fn print_table(asked: &[Asked]) {
     println!(
-        "   {:<34} {:<34} {:>5} {:>9} {:>8} {:>8}  verdict",
-        "query", "best reference", "S", "extract", "search", "re-rank"
+        "   {:<12} {:<14} {:>5} {:>6} {:>9} {:>8} {:>8}  verdict",
+        "query", "best reference", "S", "sure", "extract", "search", "re-rank"
     );
     for one in asked {
-        let best = one.results.first().map_or("-", |best| best.reference.as_str());
+        let best = one.results.first().map_or("-".into(), |best| place_and_view(&best.reference));
         let stage = |name: &str| one.stages.get(name).copied().unwrap_or_default();
         println!(
-            "   {:<34} {best:<34} {:>5} {:>6.0} ms {:>5.2} ms {:>5.0} ms  {}",
-            one.query,
+            "   {:<12} {best:<14} {:>5} {:>6} {:>6.0} ms {:>5.2} ms {:>5.0} ms  {}",
+            place_and_view(&one.query),
             one.best_score(),
+            one.confidence(),
             stage("extract"),
             stage("search"),
             stage("load") + stage("rerank"),
@@ -104,7 +116,12 @@ pub(super) fn print_table(asked: &[Asked]) {
     }
 }
 
-/// The demo in three sentences.
+/// The part of a photo's name that tells it apart, for a terminal's width: place and view.
+fn place_and_view(name: &str) -> String {
+    UtmName::parse(name).map_or_else(|_| name.to_owned(), |parts| parts.pano_id)
+}
+
+/// The demo in a few sentences.
 pub(super) fn summary(asked: &[Asked]) -> String {
     let mapped: Vec<&Asked> = asked.iter().filter(|one| one.mapped).collect();
     let unmapped = asked.iter().filter(|one| !one.mapped);
@@ -119,6 +136,15 @@ pub(super) fn summary(asked: &[Asked]) -> String {
     if let (Some(lowest), Some(highest)) = (lowest_right, highest_unmapped) {
         text += &format!(
             "\nPlaces that are not in the map score at most S = {highest}; right answers score at least {lowest}."
+        );
+    }
+    let trusted: Vec<&Asked> = asked.iter().filter(|one| one.trust.is_some_and(|(matched, _)| matched)).collect();
+    if asked.iter().any(|one| one.trust.is_some()) {
+        let right = trusted.iter().filter(|one| one.right()).count();
+        text += &format!(
+            "\nThe server trusts {} of its {} best answers; {right} of them are right.",
+            trusted.len(),
+            asked.len()
         );
     }
     text
@@ -158,12 +184,13 @@ fn all_queries(asked: &[Asked]) -> String {
                 name(one.global_best()),
                 name(one.results.first()),
                 one.best_score().to_string(),
+                one.confidence(),
                 format!("{total:.0}"),
                 one.verdict().into(),
             ]
         })
         .collect();
-    let headers = ["Query", "Best by global descriptor", "Best after re-ranking", "S", "ms", "Verdict"];
+    let headers = ["Query", "Best by global descriptor", "Best after re-ranking", "S", "Sure", "ms", "Verdict"];
     table("Every query of the demo", &headers, &rows)
 }
 

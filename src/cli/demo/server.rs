@@ -1,5 +1,6 @@
 //! The demo's own server process.
 
+use crate::cli::client::{ServerArgs, ServerClient};
 use anyhow::{Context, bail, ensure};
 use std::fs::File;
 use std::io::{BufRead, BufReader};
@@ -52,13 +53,12 @@ impl DemoServer {
 
     fn wait_until_ready(mut self) -> anyhow::Result<Self> {
         let started = Instant::now();
-        let client = reqwest::blocking::Client::new();
+        let client = ServerClient::new(ServerArgs { server: self.url.clone(), api_key: None, timeout: 10 })?;
         while started.elapsed() < START_LIMIT {
             if let Some(status) = self.child.try_wait()? {
                 bail!("the server ended with {status}; see {}", self.log.display());
             }
-            let ready = client.get(format!("{}/readyz", self.url)).send();
-            if ready.is_ok_and(|answer| answer.status().is_success()) {
+            if client.probe("/readyz").is_ok_and(|(status, _)| status == 200) {
                 return Ok(self);
             }
             std::thread::sleep(Duration::from_millis(50));

@@ -36,14 +36,20 @@ impl Row {
 }
 
 impl Metadata {
-    /// Reads the positions file, if there is one.
+    /// Reads the positions file, if there is one. Its rows name photos of `folder` from there, or from where the file
+    /// itself lies.
     pub(super) fn read(
         positions: Option<&Path>,
+        folder: &Path,
         zone: Option<UtmZone>,
         require_position: bool,
     ) -> anyhow::Result<Self> {
         let read = |path: &Path| read_positions(path).with_context(|| format!("cannot use {}", path.display()));
-        let rows = positions.map(read).transpose()?.unwrap_or_default();
+        let mut rows = positions.map(read).transpose()?.unwrap_or_default();
+        if let Some(prefix) = positions.and_then(|path| way_down(path, folder)) {
+            rows =
+                rows.into_iter().map(|(file, row)| (file.strip_prefix(&prefix).unwrap_or(&file).into(), row)).collect();
+        }
         Ok(Self { rows, zone, require_position })
     }
 
@@ -71,6 +77,13 @@ impl Metadata {
         }
         Ok(ReferenceFields { external_id: Some(external_id), location, heading, captured_at, metadata: None })
     }
+}
+
+/// From the folder of `file` down to `folder`, with a slash at the end; `None` if it does not lie below.
+fn way_down(file: &Path, folder: &Path) -> Option<String> {
+    let (from, to) = (file.parent()?.canonicalize().ok()?, folder.canonicalize().ok()?);
+    let way = to.strip_prefix(from).ok()?.to_str()?.replace('\\', "/");
+    (!way.is_empty()).then(|| way + "/")
 }
 
 fn read_positions(path: &Path) -> anyhow::Result<HashMap<String, Row>> {
@@ -126,11 +139,24 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("positions.csv");
         std::fs::write(&path, csv).unwrap();
-        Metadata::read(Some(&path), Some("33T".parse().unwrap()), true)
+        Metadata::read(Some(&path), folder.path(), Some("33T".parse().unwrap()), true)
     }
 
     fn id() -> ExternalId {
         "x".parse().unwrap()
+    }
+
+    #[test]
+    fn rows_may_be_named_from_where_the_file_lies() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("positions.csv");
+        std::fs::write(&path, "file,lat,lon\ndatabase/a.jpg,1,2\nb.jpg,3,4\nqueries/c.jpg,5,6\n").unwrap();
+        let database = folder.path().join("database");
+        std::fs::create_dir(&database).unwrap();
+        let metadata = Metadata::read(Some(&path), &database, None, true).unwrap();
+        assert_eq!(metadata.without_image(["a.jpg", "b.jpg"].into_iter()), ["queries/c.jpg"]);
+        let lat = |name: &str| metadata.fields(name, id(), b"").unwrap().location.unwrap().lat();
+        assert_eq!((lat("a.jpg"), lat("b.jpg")), (1.0, 3.0));
     }
 
     #[test]

@@ -73,7 +73,7 @@ pub fn run(args: ImportArgs) -> anyhow::Result<()> {
     ensure!(args.attempts > 0, "--attempts must be at least 1");
     let images = list_images(&args.folder)?;
     ensure!(!images.is_empty(), "{} holds no JPEG, PNG or WebP image", args.folder.display());
-    let metadata = Metadata::read(args.positions.as_deref(), args.utm_zone, args.require_position)?;
+    let metadata = Metadata::read(args.positions.as_deref(), &args.folder, args.utm_zone, args.require_position)?;
     let unmatched = metadata.without_image(images.iter().map(|(name, _)| name.as_str()));
     if let Some(example) = unmatched.first() {
         eprintln!("warning: {} rows of the positions file name no image, such as {example:?}", unmatched.len());
@@ -223,7 +223,7 @@ mod tests {
 
     fn import(folder: &Path, sink: &Memory, report: &Path) -> (verdict::Summary, Option<String>) {
         let images = list_images(folder).unwrap();
-        let metadata = Metadata::read(None, None, false).unwrap();
+        let metadata = Metadata::read(None, Path::new("."), None, false).unwrap();
         let map = "m".parse().unwrap();
         let present = sink.present(&map).unwrap();
         let log = VerdictLog::create(Some(report)).unwrap();

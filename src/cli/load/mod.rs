@@ -7,7 +7,9 @@
 mod client;
 mod report;
 
+use crate::eval::datasets::list_images;
 use anyhow::{Context, bail, ensure};
+use bytes::Bytes;
 use client::{Outcome, Target};
 use report::{Report, Tally};
 use std::path::{Path, PathBuf};
@@ -155,23 +157,9 @@ async fn measure_capacity(target: &Arc<Target>, clients: usize, seconds: f64) ->
 }
 
 /// Reads every image below `folder`, sorted by path so that runs repeat.
-fn read_images(folder: &Path) -> anyhow::Result<Vec<(&'static str, bytes::Bytes)>> {
-    let mut paths: Vec<PathBuf> = walkdir::WalkDir::new(folder)
-        .into_iter()
-        .collect::<Result<Vec<_>, _>>()
-        .with_context(|| format!("cannot read {}", folder.display()))?
-        .into_iter()
-        .map(walkdir::DirEntry::into_path)
-        .filter(|path| client::media_type(path).is_some())
-        .collect();
-    paths.sort();
-    ensure!(!paths.is_empty(), "{} holds no .jpg, .png or .webp file", folder.display());
-    paths
-        .iter()
-        .filter_map(|path| client::media_type(path).map(|kind| (kind, path)))
-        .map(|(kind, path)| {
-            let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-            Ok((kind, bytes.into()))
-        })
-        .collect()
+fn read_images(folder: &Path) -> anyhow::Result<Vec<Bytes>> {
+    let images = list_images(folder)?;
+    ensure!(!images.is_empty(), "{} holds no JPEG, PNG or WebP image", folder.display());
+    let read = |path: PathBuf| std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()));
+    images.into_iter().map(|(_, path)| Ok(read(path)?.into())).collect()
 }

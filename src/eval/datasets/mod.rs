@@ -9,6 +9,7 @@ mod msls;
 mod neighbours;
 mod nordland;
 mod pairs;
+mod positions;
 mod robotcar;
 mod table;
 mod utm;
@@ -153,7 +154,7 @@ pub enum DatasetKind {
     RobotcarSeasonsV2,
     /// Any set with `@utm_east@utm_north@...` names.
     Utm,
-    /// `database/`, `queries/` and `ground_truth.csv` below the root.
+    /// `database/`, `queries/` and `ground_truth.csv` below the root; positions from `positions.csv` if it is there.
     Csv,
 }
 

@@ -5,15 +5,18 @@
 
 use super::files::list_images;
 use super::table::Table;
-use super::{Dataset, Item, Truth};
+use super::{Dataset, Item, Truth, positions};
 use crate::eval::EvalError;
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Reads the images of both folders and the pairs between them.
+/// Reads the images of both folders, the pairs between them, and positions from a `positions.csv` beside the pairs.
 pub fn load_pairs(database_dir: &Path, queries_dir: &Path, ground_truth: &Path) -> Result<Dataset, EvalError> {
-    let database = items(database_dir)?;
-    let queries = items(queries_dir)?;
+    let mut database = items(database_dir)?;
+    let mut queries = items(queries_dir)?;
+    if let Some(folder) = ground_truth.parent() {
+        positions::locate(folder, [&mut database, &mut queries])?;
+    }
     let mut labels = Labels::new(database_dir, queries_dir, &database, &queries, ground_truth);
     let table = Table::read(ground_truth)?;
     let (query_column, reference_column) = (table.column("query")?, table.column("reference")?);

@@ -34,6 +34,12 @@ impl UtmZone {
         ("CDEFGHJKLMNPQRSTUVWX".contains(band)).then_some(Self { number, band })
     }
 
+    /// The zone a position lies in; none beyond 80 degrees south and 84 north.
+    pub fn of(position: GeoPoint) -> Option<Self> {
+        let band = utm::lat_to_zone_letter(position.lat())?;
+        Some(Self { number: utm::lat_lon_to_zone_number(position.lat(), position.lon()), band })
+    }
+
     /// The position of grid coordinates in this zone.
     pub fn to_geo(self, point: MetricPoint) -> Option<GeoPoint> {
         let (lat, lon) = utm::wsg84_utm_to_lat_lon(point.east, point.north, self.number, self.band).ok()?;

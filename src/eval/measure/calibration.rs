@@ -1,36 +1,44 @@
-//! From scores to a probability that the best answer is right.
+//! From scores to a probability that the best answer is right, and the threshold from which on it is trusted.
 //!
 //! Logistic regression on ln(1 + S) and the global distance, fitted by Newton's method with a small ridge penalty, so
-//! that separable data do not send the weights to infinity. How well it holds is told by the expected calibration
+//! that separable data do not send the weights to infinity. A slope of the wrong sign (fewer inliers making an answer
+//! surer) is an accident of few data: it is held at zero. How well the curve holds is told by the expected calibration
 //! error: queries are put into ten bins of confidence, and the mean confidence is compared with the share of right
-//! answers.
+//! answers. What is told about unseen queries comes from cross-validation, which keeps the answers to one query
+//! together.
 
+use crate::types::{ConfidenceCurve, ConfidenceWeights};
 use nalgebra::{Matrix3, Vector3};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
+use std::collections::BTreeMap;
 
 /// A query's best answer with what is known about it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TopOne {
-    /// S of the best answer.
-    pub spatial_score: f64,
+    /// The query; answers to the same one (with and without its place in the database) share it.
+    pub query: usize,
+    /// S of the best answer; `None` if it was not re-ranked.
+    pub spatial_score: Option<f64>,
     /// Its Euclidean distance.
     pub global_distance: f64,
     /// Whether it is a positive; false where no match exists.
     pub correct: bool,
+    /// Whether the database searched shows the place at all.
+    pub has_match: bool,
 }
 
-/// Fitted weights: confidence = sigmoid(bias + score ln(1 + S) + distance d).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Calibration {
-    /// Constant term.
-    pub bias: f64,
-    /// Weight of ln(1 + S).
-    pub score: f64,
-    /// Weight of the global distance.
-    pub distance: f64,
+/// An answer with the confidence given to it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Prediction {
+    /// Probability, 0 to 1, that it is right.
+    pub confidence: f64,
+    /// Whether it is.
+    pub correct: bool,
+    /// Whether the database searched shows the place at all.
+    pub has_match: bool,
 }
 
 /// Why no calibration could be fitted.
@@ -46,25 +54,39 @@ pub enum CalibrationError {
     },
 }
 
-impl Calibration {
-    /// Probability, 0 to 1, that an answer with this score and distance is right.
-    pub fn confidence(&self, spatial_score: f64, global_distance: f64) -> f64 {
-        sigmoid(self.bias + self.score * spatial_score.max(0.0).ln_1p() + self.distance * global_distance)
-    }
-}
+/// The penalty that suits hundreds to thousands of answers.
+pub const RIDGE: f64 = 1e-2;
 
-fn sigmoid(x: f64) -> f64 {
-    1.0 / (1.0 + (-x).exp())
-}
+/// Parts in which answers are divided to judge a fit by what it has not seen.
+pub const FOLDS: usize = 5;
 
-/// Fits a calibration. `ridge` penalises the two slopes (not the bias); 1e-2 is a sensible value.
-pub fn fit(answers: &[TopOne], ridge: f64) -> Result<Calibration, CalibrationError> {
+/// Fits the weights. `ridge` penalises the two slopes (not the bias); [`RIDGE`] is a sensible value.
+pub fn fit(answers: &[TopOne], ridge: f64) -> Result<ConfidenceWeights, CalibrationError> {
     let right = answers.iter().filter(|answer| answer.correct).count();
     let wrong = answers.len() - right;
     if right == 0 || wrong == 0 {
         return Err(CalibrationError::OneSided { right, wrong });
     }
-    let features = |answer: &TopOne| Vector3::new(1.0, answer.spatial_score.max(0.0).ln_1p(), answer.global_distance);
+    let (mut use_score, mut use_distance) = (1.0, 1.0);
+    // Each round can only take a slope away, so three rounds always end.
+    loop {
+        let weights = maximum_likelihood(answers, ridge, Vector3::new(1.0, use_score, use_distance));
+        match (weights[1] < 0.0, weights[2] > 0.0) {
+            (false, false) => {
+                return Ok(ConfidenceWeights { bias: weights[0], score: weights[1], distance: weights[2] });
+            }
+            (score_is_wrong, _) if score_is_wrong => use_score = 0.0,
+            _ => use_distance = 0.0,
+        }
+    }
+}
+
+/// Newton's method on the penalised likelihood; features whose `used` is 0 get weight 0.
+fn maximum_likelihood(answers: &[TopOne], ridge: f64, used: Vector3<f64>) -> Vector3<f64> {
+    let features = |answer: &TopOne| {
+        let inliers = answer.spatial_score.unwrap_or(0.0).max(0.0).ln_1p();
+        Vector3::new(1.0, inliers, answer.global_distance).component_mul(&used)
+    };
     let penalty = Matrix3::from_diagonal(&Vector3::new(1e-9, ridge, ridge));
     let loss = |w: &Vector3<f64>| -> f64 {
         let data: f64 = answers
@@ -98,29 +120,114 @@ pub fn fit(answers: &[TopOne], ridge: f64) -> Result<Calibration, CalibrationErr
             break;
         }
     }
-    Ok(Calibration { bias: weights[0], score: weights[1], distance: weights[2] })
+    weights
 }
 
-/// The penalty that suits hundreds to thousands of answers.
-pub const RIDGE: f64 = 1e-2;
+fn sigmoid(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
+}
 
-/// Confidence of every answer from a fit that has not seen it, with whether it was right. Each fold holds its share of
-/// right and of wrong answers; an answer whose other folds are one-sided is left out.
-pub fn cross_validate(answers: &[TopOne], ridge: f64, folds: usize, seed: u64) -> Vec<(f64, bool)> {
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let (mut right, mut wrong): (Vec<TopOne>, Vec<TopOne>) = answers.iter().partition(|answer| answer.correct);
-    right.shuffle(&mut random);
-    wrong.shuffle(&mut random);
-    let dealt: Vec<(usize, TopOne)> =
-        right.into_iter().chain(wrong).enumerate().map(|(i, answer)| (i % folds.max(2), answer)).collect();
+/// What `weights` say about every answer.
+pub fn predict(weights: &ConfidenceWeights, answers: &[TopOne]) -> Vec<Prediction> {
+    let one = |answer: &TopOne| Prediction {
+        confidence: weights.confidence(answer.spatial_score, answer.global_distance),
+        correct: answer.correct,
+        has_match: answer.has_match,
+    };
+    answers.iter().map(one).collect()
+}
+
+/// Confidence of every answer from a fit that has not seen its query. Queries answered alike (only right, only wrong,
+/// both) are dealt evenly to the folds; a fold whose others are one-sided is left out.
+pub fn cross_validate(answers: &[TopOne], ridge: f64, folds: usize, seed: u64) -> Vec<Prediction> {
+    let mut kinds: BTreeMap<usize, (bool, bool)> = BTreeMap::new();
+    for answer in answers {
+        let kind = kinds.entry(answer.query).or_default();
+        *kind = (kind.0 | answer.correct, kind.1 | !answer.correct);
+    }
+    let mut queries: Vec<(usize, (bool, bool))> = kinds.into_iter().collect();
+    queries.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
+    queries.sort_by_key(|&(_, kind)| kind);
+    let folds = folds.max(2);
+    let fold_of: BTreeMap<usize, usize> =
+        queries.into_iter().enumerate().map(|(place, (query, _))| (query, place % folds)).collect();
     let mut predictions = Vec::new();
-    for fold in 0..folds.max(2) {
-        let others: Vec<TopOne> = dealt.iter().filter(|(own, _)| *own != fold).map(|(_, answer)| *answer).collect();
+    for fold in 0..folds {
+        let (own, others): (Vec<TopOne>, Vec<TopOne>) =
+            answers.iter().partition(|answer| fold_of.get(&answer.query) == Some(&fold));
         let Ok(fitted) = fit(&others, ridge) else { continue };
-        let held_out = dealt.iter().filter(|(own, _)| *own == fold);
-        predictions.extend(held_out.map(|(_, a)| (fitted.confidence(a.spatial_score, a.global_distance), a.correct)));
+        predictions.extend(predict(&fitted, &own));
     }
     predictions
+}
+
+/// Where on a curve trust begins, and what it costs.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Trusted {
+    /// Answers of this confidence or more are trusted.
+    pub threshold: f64,
+    /// Answers that are.
+    pub count: usize,
+    /// Share of right ones among them, 0 to 1; 1 if there are none.
+    pub precision: f64,
+    /// Right ones among them as a share of the queries that have a match, 0 to 1.
+    pub recall: f64,
+}
+
+/// What trusting from `threshold` on comes to.
+pub fn trusted(predictions: &[Prediction], threshold: f64) -> Trusted {
+    let accepted = || predictions.iter().filter(|one| one.confidence >= threshold);
+    let (count, right) = (accepted().count(), accepted().filter(|one| one.correct).count());
+    let with_match = predictions.iter().filter(|one| one.has_match).count();
+    Trusted {
+        threshold,
+        count,
+        precision: if count == 0 { 1.0 } else { right as f64 / count as f64 },
+        recall: right as f64 / with_match.max(1) as f64,
+    }
+}
+
+/// The lowest threshold from which on the share of right answers reaches `target`, but never below one half: an answer
+/// that is more likely wrong than right is not trusted, however few wrong ones there are. Where even the surest answers
+/// miss the target it is 1, which trusts nothing but certainty.
+pub fn choose_threshold(predictions: &[Prediction], target: f64) -> Trusted {
+    let mut candidates: Vec<f64> =
+        predictions.iter().map(|one| one.confidence).filter(|confidence| *confidence >= 0.5).collect();
+    candidates.push(0.5);
+    candidates.sort_unstable_by(f64::total_cmp);
+    candidates.dedup();
+    let reached = candidates.into_iter().map(|threshold| trusted(predictions, threshold));
+    let mut reached = reached.filter(|point| point.count > 0 && point.precision >= target);
+    reached.next().unwrap_or_else(|| trusted(predictions, 1.0))
+}
+
+/// A curve with all that is known about it, and its error on the answers it was fitted on.
+///
+/// Weights and shares are rounded to six digits, so that a file shows what is meant.
+pub fn fit_curve(answers: &[TopOne], target: f64, seed: u64) -> Result<(ConfidenceCurve, f64), CalibrationError> {
+    let raw = fit(answers, RIDGE)?;
+    let weights =
+        ConfidenceWeights { bias: rounded(raw.bias), score: rounded(raw.score), distance: rounded(raw.distance) };
+    let unseen = cross_validate(answers, RIDGE, FOLDS, seed);
+    let at = choose_threshold(&unseen, target);
+    let count = |wanted: fn(&TopOne) -> bool| answers.iter().filter(|answer| wanted(answer)).count() as u64;
+    let curve = ConfidenceCurve {
+        weights,
+        threshold: rounded(at.threshold),
+        right: count(|answer| answer.correct),
+        wrong: count(|answer| !answer.correct),
+        without_match: count(|answer| !answer.has_match),
+        precision: rounded(at.precision),
+        recall: rounded(at.recall),
+        expected_calibration_error: rounded(calibration_error(&reliability(&unseen))),
+    };
+    let in_sample = calibration_error(&reliability(&predict(&weights, answers)));
+    Ok((curve, in_sample))
+}
+
+fn rounded(value: f64) -> f64 {
+    // Adding zero turns -0 into 0.
+    (value * 1e6).round() / 1e6 + 0.0
 }
 
 /// One bin of confidence.
@@ -135,12 +242,12 @@ pub struct ReliabilityBin {
 }
 
 /// Ten bins of equal width; empty ones are left out.
-pub fn reliability(predictions: &[(f64, bool)]) -> Vec<ReliabilityBin> {
+pub fn reliability(predictions: &[Prediction]) -> Vec<ReliabilityBin> {
     let mut bins = [(0.0, 0usize, 0usize); 10];
-    for &(confidence, correct) in predictions {
-        let bin = &mut bins[((confidence * 10.0) as usize).min(9)];
-        bin.0 += confidence;
-        bin.1 += usize::from(correct);
+    for prediction in predictions {
+        let bin = &mut bins[((prediction.confidence * 10.0) as usize).min(9)];
+        bin.0 += prediction.confidence;
+        bin.1 += usize::from(prediction.correct);
         bin.2 += 1;
     }
     let filled = bins.into_iter().filter(|bin| bin.2 > 0);
@@ -160,49 +267,4 @@ pub fn calibration_error(bins: &[ReliabilityBin]) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use rand::RngExt;
-
-    #[test]
-    fn planted_weights_are_recovered() {
-        let truth = Calibration { bias: -3.0, score: 1.5, distance: -2.0 };
-        let mut random = ChaCha8Rng::seed_from_u64(3);
-        let answers: Vec<TopOne> = (0..20_000)
-            .map(|_| {
-                let (spatial_score, global_distance) = (random.random_range(0.0..120.0), random.random_range(0.0..1.5));
-                let correct = random.random::<f64>() < truth.confidence(spatial_score, global_distance);
-                TopOne { spatial_score, global_distance, correct }
-            })
-            .collect();
-        let fitted = fit(&answers, 1e-3).unwrap();
-        for (a, b) in [(fitted.bias, truth.bias), (fitted.score, truth.score), (fitted.distance, truth.distance)] {
-            assert!((a - b).abs() < 0.25, "{fitted:?}");
-        }
-        let predictions: Vec<_> =
-            answers.iter().map(|a| (fitted.confidence(a.spatial_score, a.global_distance), a.correct)).collect();
-        assert!(calibration_error(&reliability(&predictions)) < 0.02);
-        let unseen = cross_validate(&answers, 1e-3, 5, 1);
-        assert_eq!(unseen.len(), answers.len());
-        assert!(calibration_error(&reliability(&unseen)) < 0.02);
-    }
-
-    #[test]
-    fn separable_answers_stay_finite_and_one_kind_is_refused() {
-        let answer = |spatial_score, correct| TopOne { spatial_score, global_distance: 0.5, correct };
-        let answers = [answer(100.0, true), answer(90.0, true), answer(5.0, false), answer(8.0, false)];
-        let fitted = fit(&answers, 1e-2).unwrap();
-        assert!(fitted.confidence(100.0, 0.5) > 0.9 && fitted.confidence(5.0, 0.5) < 0.1, "{fitted:?}");
-        assert!(fitted.score.is_finite());
-        assert_eq!(fit(&answers[..2], 1e-2), Err(CalibrationError::OneSided { right: 2, wrong: 0 }));
-    }
-
-    #[test]
-    fn calibration_error_by_hand() {
-        // Confidence 0.95 with half of them right; confidence 0.05 with none right.
-        let predictions = [(0.95, true), (0.95, false), (0.05, false), (0.05, false)];
-        let error = calibration_error(&reliability(&predictions));
-        assert!((error - (0.45 * 0.5 + 0.05 * 0.5)).abs() < 1e-12, "{error}");
-        assert_eq!(calibration_error(&[]), 0.0);
-    }
-}
+mod tests;

@@ -8,7 +8,8 @@ mod ranking;
 mod rejection;
 
 pub use calibration::{
-    Calibration, CalibrationError, RIDGE, ReliabilityBin, TopOne, calibration_error, cross_validate, fit, reliability,
+    CalibrationError, FOLDS, Prediction, RIDGE, ReliabilityBin, TopOne, Trusted, calibration_error, choose_threshold,
+    cross_validate, fit, fit_curve, predict, reliability, trusted,
 };
 pub use poses::{POSE_THRESHOLDS, PoseAccuracy, pose_accuracy};
 pub use ranking::{Interval, RECALL_AT, average_precision, bootstrap_recall, first_hit, recall_at};

@@ -14,6 +14,7 @@ pub use plots::plots;
 pub use svg::{Histogram, LineChart, Series};
 pub use text::text;
 
+use super::calibrate::Applied;
 use super::datasets::Dataset;
 use super::measure::RECALL_AT;
 use super::run::Answer;
@@ -31,6 +32,7 @@ pub fn html(summary: &Summary, dataset: &Dataset, answers: &[Answer], details: &
         escape(summary.config.model.as_str())
     );
     body += &recall_table(summary);
+    body += &calibration_table(summary);
     body += &poses_table(summary);
     body += &groups_table(summary);
     body += &costs_table(summary);
@@ -86,6 +88,28 @@ fn recall_table(summary: &Summary) -> String {
     }
     let headers: Vec<&str> = headers.iter().map(String::as_str).collect();
     table("Recall in percent over the queries that have a match, with bootstrap intervals", &headers, &rows)
+}
+
+fn calibration_table(summary: &Summary) -> String {
+    let mut rows = Vec::new();
+    if let Some(fitted) = &summary.calibration {
+        let error = format!("{:.3}", fitted.expected_calibration_error);
+        rows.push(vec!["fitted here, five-fold".into(), error, "-".into(), "-".into(), "-".into()]);
+    }
+    if let Some(Applied { expected_calibration_error, trusted, .. }) = &summary.shipped_calibration {
+        rows.push(vec![
+            "the model's own".into(),
+            format!("{expected_calibration_error:.3}"),
+            format!("{:.3}", trusted.threshold),
+            format!("{:.1}", 100.0 * trusted.precision),
+            format!("{:.1}", 100.0 * trusted.recall),
+        ]);
+    }
+    if rows.is_empty() {
+        return String::new();
+    }
+    let headers = ["confidence", "calibration error", "trusted from", "precision of those, %", "recall of those, %"];
+    table("How far confidences can be believed", &headers, &rows)
 }
 
 fn poses_table(summary: &Summary) -> String {

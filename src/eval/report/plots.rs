@@ -3,7 +3,7 @@
 use super::html::escape;
 use super::svg::{Histogram, LineChart, Series};
 use crate::eval::datasets::{Dataset, Truth};
-use crate::eval::measure::{Rejection, first_hit, recall_at};
+use crate::eval::measure::{Rejection, ReliabilityBin, first_hit, recall_at};
 use crate::eval::run::Answer;
 use crate::eval::summary::Summary;
 
@@ -23,7 +23,8 @@ pub fn plots(summary: &Summary, dataset: &Dataset, answers: &[Answer]) -> String
         figures.push((score_plot(dataset, answers), "S of the best answer, by whether it is right."));
     }
     if let Some(plot) = reliability_plot(summary) {
-        figures.push((plot, "Five-fold cross-validated confidence from S and distance; the dashed line is ideal."));
+        figures.push((plot, "Share of right answers by confidence, with the calibration error; the dashed line is ideal. What is fitted \
+             here is five-fold cross-validated."));
     }
     let figure = |(svg, caption): &(String, &str)| {
         format!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escape(caption))
@@ -102,16 +103,30 @@ fn score_plot(dataset: &Dataset, answers: &[Answer]) -> String {
 }
 
 fn reliability_plot(summary: &Summary) -> Option<String> {
-    let calibration = summary.calibration.as_ref()?;
-    let ideal = Series { name: String::new(), class: "muted", points: vec![(0.0, 0.0), (1.0, 1.0)], dots: false };
-    let points = calibration.bins.iter().map(|bin| (bin.confidence, bin.accuracy)).collect();
+    let line = |name: String, class, bins: &[ReliabilityBin]| {
+        let points = bins.iter().map(|bin| (bin.confidence, bin.accuracy)).collect();
+        Series { name, class, points, dots: true }
+    };
+    let mut series = Vec::new();
+    if let Some(fitted) = &summary.calibration {
+        let name = format!("fitted here, error {:.3}", fitted.expected_calibration_error);
+        series.push(line(name, "a", &fitted.bins));
+    }
+    if let Some(shipped) = &summary.shipped_calibration {
+        let name = format!("the model's own, error {:.3}", shipped.expected_calibration_error);
+        series.push(line(name, "b", &shipped.bins));
+    }
+    if series.is_empty() {
+        return None;
+    }
+    series.insert(0, Series { name: String::new(), class: "muted", points: vec![(0.0, 0.0), (1.0, 1.0)], dots: false });
     let chart = LineChart {
-        title: format!("Reliability, calibration error {:.3}", calibration.expected_calibration_error),
+        title: "Reliability of confidences".into(),
         x_label: "confidence".into(),
         y_label: "share right".into(),
         x_range: (0.0, 1.0),
         y_range: (0.0, 1.0),
-        series: vec![ideal, Series { name: String::new(), class: "a", points, dots: true }],
+        series,
     };
     Some(chart.render())
 }

@@ -1,5 +1,6 @@
 //! The result as plain text for a terminal.
 
+use crate::eval::calibrate::Applied;
 use crate::eval::measure::RECALL_AT;
 use crate::eval::summary::{AtK, Summary};
 use std::fmt::Write;
@@ -29,6 +30,16 @@ pub fn text(summary: &Summary) -> String {
     }
     if let Some(calibration) = &summary.calibration {
         let _ = writeln!(out, "calibration error {:.3} (five-fold)", calibration.expected_calibration_error);
+    }
+    if let Some(Applied { expected_calibration_error, trusted, .. }) = &summary.shipped_calibration {
+        let _ = writeln!(
+            out,
+            "calibration error {expected_calibration_error:.3} of the model's own curve, which trusts {} answers: \
+             precision {:.1}%, recall {:.1}%",
+            trusted.count,
+            100.0 * trusted.precision,
+            100.0 * trusted.recall
+        );
     }
     let s = &summary.seconds;
     let _ = writeln!(

@@ -5,12 +5,14 @@ use super::weights::{PackedBlock, PackedLinear};
 use crate::extract::preset::LAYER_NORM_EPS;
 use crate::kernels::Simd;
 use crate::kernels::aligned::AlignedBuffer;
-use crate::kernels::attention::{AttentionShape, attend, store_keys, store_values};
-use crate::kernels::elementwise::{Epilogue, finish_block, normalize_rows};
-use crate::kernels::gemm::{Panel, Rows, Tiling, multiply_panel};
+use crate::kernels::attention::{AttentionShape, attend, store_keys, store_queries, store_values};
+use crate::kernels::elementwise::{Epilogue, Product, finish_block, normalize_rows};
+use crate::kernels::gemm::{Tiling, multiply_panel};
+use crate::kernels::operand::{Left, OperandBuffer};
+use std::ops::Range;
 
 /// Width of the slice of the MLP's hidden layer that exists at a time.
-const HIDDEN_SLICE: usize = 384;
+pub(super) const HIDDEN_SLICE: usize = 384;
 
 /// What every chunk of an encoder has in common.
 #[derive(Debug, Clone, Copy)]
@@ -29,12 +31,12 @@ pub(super) struct Chunk<'a> {
     pub index: usize,
     /// Tokens, `[chunk_rows, dim]`.
     pub tokens: &'a mut [f32],
-    /// Queries, `[chunk_rows, dim]`.
-    pub queries: &'a mut [f32],
+    /// Queries, `[chunk_rows, query_len]`.
+    pub queries: &'a mut [u32],
     /// Keys for the next block.
-    pub keys: &'a mut [f32],
+    pub keys: &'a mut [u32],
     /// Values for the next block.
-    pub values: &'a mut [f32],
+    pub values: &'a mut [u32],
 }
 
 /// Buffers of one thread, reused for every chunk.
@@ -46,8 +48,10 @@ pub(super) struct Scratch {
     input: AlignedBuffer<f32>,
     /// A slice of the hidden layer, or patches, `[chunk_rows, ..]`.
     hidden: AlignedBuffer<f32>,
-    /// Output panels of the MLP while they are summed, `[panels][chunk_rows, columns]`.
-    sums: AlignedBuffer<f32>,
+    /// One of the above in the format of the next product.
+    packed: OperandBuffer,
+    /// The same for what is computed while that is still needed.
+    packed_block: OperandBuffer,
     /// Attention scores of a group of rows.
     scores: AlignedBuffer<f32>,
 }
@@ -91,11 +95,11 @@ impl ChunkPlan {
         let present = (self.shape.tokens - first).min(self.shape.chunk_rows) * self.dim;
         chunk.tokens[..present].copy_from_slice(&positions[first * self.dim..][..present]);
         chunk.tokens[present..].fill(0.0);
-        let Scratch { block, hidden, .. } = scratch;
-        let left = Rows { data: hidden, stride: self.patch_len };
-        self.linear(rows, left, embedding, block, |panel, bias, block| {
+        let Scratch { block, hidden, packed, .. } = scratch;
+        let left = packed.pack(self.simd, embedding.weight.format(), rows, self.patch_len, (hidden, self.patch_len));
+        self.linear(rows, left, embedding, block, |panel, product| {
             let out = &mut chunk.tokens[panel * self.columns()..];
-            finish_block(self.simd, Epilogue::BiasResidual, rows, block, bias, out, self.dim);
+            finish_block(self.simd, Epilogue::BiasResidual, product, out, self.dim);
         });
     }
 
@@ -103,23 +107,19 @@ impl ChunkPlan {
     pub fn project(&self, chunk: &mut Chunk<'_>, block: &PackedBlock, scratch: &mut Scratch) {
         let (rows, columns, head_dim) = (self.rows(chunk.index), self.columns(), self.shape.head_dim);
         self.normalize(chunk, rows, scratch);
-        let Scratch { block: product, input, hidden, .. } = scratch;
+        let Scratch { block: sums, input, hidden, packed, packed_block, .. } = scratch;
         hidden.resize(self.shape.chunk_rows * columns);
-        let left = Rows { data: input, stride: self.dim };
-        self.linear(rows, left, &block.qkv, product, |panel, bias, product| {
-            let column = panel * columns;
-            let (part, column) = (column / self.dim, column % self.dim);
-            if part == 0 {
-                let out = &mut chunk.queries[column..];
-                return finish_block(self.simd, Epilogue::Bias, rows, product, bias, out, self.dim);
-            }
-            let biased = &mut hidden[..rows * columns];
-            finish_block(self.simd, Epilogue::Bias, rows, product, bias, biased, columns);
+        let left = packed.pack(self.simd, block.qkv.weight.format(), rows, self.dim, (input, self.dim));
+        self.linear(rows, left, &block.qkv, sums, |panel, product| {
+            finish_block(self.simd, Epilogue::Bias, product, hidden, columns);
+            let finished =
+                packed_block.pack(self.simd, self.shape.format, rows, columns, (&hidden[..rows * columns], columns));
+            let (part, column) = (panel * columns / self.dim, panel * columns % self.dim);
             let (head, dim) = (column / head_dim, column % head_dim);
-            if part == 1 {
-                store_keys(self.simd, &self.shape, head, dim, biased, chunk.keys);
-            } else {
-                store_values(self.simd, &self.shape, head, dim, biased, chunk.values);
+            match part {
+                0 => store_queries(&self.shape, head, dim, finished.rows, chunk.queries),
+                1 => store_keys(self.simd, &self.shape, head, dim, finished.rows, chunk.keys),
+                _ => store_values(self.simd, &self.shape, head, dim, finished.rows, chunk.values),
             }
         });
     }
@@ -128,7 +128,7 @@ impl ChunkPlan {
     pub fn transform(
         &self,
         chunk: &mut Chunk<'_>,
-        key_values: (&[f32], &[f32]),
+        key_values: (&[u32], &[u32]),
         block: &PackedBlock,
         scratch: &mut Scratch,
     ) {
@@ -136,15 +136,15 @@ impl ChunkPlan {
         scratch.input.resize(self.shape.chunk_rows * self.dim);
         scratch.scores.resize(self.shape.scratch_len(self.simd));
         for head in 0..self.shape.heads {
-            let queries = Rows { data: &chunk.queries[head * self.shape.head_dim..], stride: self.dim };
             let out = &mut scratch.input[head * self.shape.head_dim..];
-            attend(self.simd, &self.shape, head, queries, rows, key_values, &mut scratch.scores, out);
+            let queries = (&*chunk.queries, rows);
+            attend(self.simd, &self.shape, head, queries, key_values, &mut scratch.scores, out, self.dim);
         }
-        let Scratch { block: product, input, .. } = scratch;
-        let left = Rows { data: input, stride: self.dim };
-        self.linear(rows, left, &block.proj, product, |panel, bias, product| {
+        let Scratch { block: sums, input, packed, .. } = scratch;
+        let left = packed.pack(self.simd, block.proj.weight.format(), rows, self.dim, (input, self.dim));
+        self.linear(rows, left, &block.proj, sums, |panel, product| {
             let out = &mut chunk.tokens[panel * self.columns()..];
-            finish_block(self.simd, Epilogue::BiasResidual, rows, product, bias, out, self.dim);
+            finish_block(self.simd, Epilogue::BiasResidual, product, out, self.dim);
         });
         self.feed_forward(chunk, rows, block, scratch);
     }
@@ -153,26 +153,23 @@ impl ChunkPlan {
     fn feed_forward(&self, chunk: &mut Chunk<'_>, rows: usize, block: &PackedBlock, scratch: &mut Scratch) {
         let (simd, columns) = (self.simd, self.columns());
         self.normalize(chunk, rows, scratch);
-        let Scratch { block: product, input, hidden, sums, .. } = scratch;
-        let (fc1, fc2, block_len) = (&block.fc1, &block.fc2, self.shape.chunk_rows * columns);
+        let Scratch { block: sums, input, hidden, packed, packed_block, .. } = scratch;
+        let (fc1, fc2) = (&block.fc1, &block.fc2);
         hidden.resize(self.shape.chunk_rows * HIDDEN_SLICE);
-        sums.resize(fc2.weight.panels() * block_len);
-        for from in (0..fc1.weight.n()).step_by(HIDDEN_SLICE) {
+        let normalized = packed.pack(simd, fc1.weight.format(), rows, self.dim, (input, self.dim));
+        for (slice, from) in (0..fc1.weight.n()).step_by(HIDDEN_SLICE).enumerate() {
             let to = fc1.weight.n().min(from + HIDDEN_SLICE);
-            let left = Rows { data: input, stride: self.dim };
-            self.panels(rows, left, fc1, from / columns..to.div_ceil(columns), product, |panel, bias, product| {
+            self.panels((rows, normalized), fc1, 0, from / columns..to.div_ceil(columns), sums, |panel, product| {
                 let out = &mut hidden[panel * columns - from..];
-                finish_block(simd, Epilogue::BiasGelu, rows, product, bias, out, HIDDEN_SLICE);
+                finish_block(simd, Epilogue::BiasGelu, product, out, HIDDEN_SLICE);
             });
-            let left = Rows { data: hidden, stride: HIDDEN_SLICE };
-            for (panel, sums) in sums.chunks_exact_mut(block_len).enumerate() {
-                let right = Panel::whole(fc2.weight.panel_rows(panel, from, to), to - from);
-                multiply_panel(simd, rows, left, right, sums, columns, from > 0);
-            }
-        }
-        for (panel, sums) in sums.chunks_exact(block_len).enumerate() {
-            let (bias, out) = (fc2.panel_bias(simd, panel), &mut chunk.tokens[panel * columns..]);
-            finish_block(simd, Epilogue::BiasResidual, rows, sums, bias, out, self.dim);
+            let left = packed_block.pack(simd, fc2.weight.format(), rows, to - from, (hidden, HIDDEN_SLICE));
+            self.panels((rows, left), fc2, slice, 0..fc2.weight.panels(), sums, |panel, product| {
+                // The bias is added once, with the first slice.
+                let product = Product { bias: product.bias.filter(|_| slice == 0), ..product };
+                let out = &mut chunk.tokens[panel * columns..];
+                finish_block(simd, Epilogue::BiasResidual, product, out, self.dim);
+            });
         }
     }
 
@@ -182,33 +179,35 @@ impl ChunkPlan {
         normalize_rows(self.simd, self.dim, LAYER_NORM_EPS, &chunk.tokens[..len], &mut scratch.input[..len]);
     }
 
-    /// All panels of a layer: `finish(panel, bias, product)` sees each while it is hot.
+    /// All panels of a layer: `finish(panel, product)` sees each while it is hot.
     fn linear(
         &self,
         rows: usize,
-        left: Rows<'_>,
+        left: Left<'_>,
         layer: &PackedLinear,
-        block: &mut AlignedBuffer<f32>,
-        finish: impl FnMut(usize, &[f32], &[f32]),
+        sums: &mut AlignedBuffer<f32>,
+        finish: impl FnMut(usize, Product<'_>),
     ) {
-        self.panels(rows, left, layer, 0..layer.weight.panels(), block, finish);
+        self.panels((rows, left), layer, 0, 0..layer.weight.panels(), sums, finish);
     }
 
+    /// The given panels of a slice of a layer.
     fn panels(
         &self,
-        rows: usize,
-        left: Rows<'_>,
+        (rows, left): (usize, Left<'_>),
         layer: &PackedLinear,
-        panels: std::ops::Range<usize>,
-        block: &mut AlignedBuffer<f32>,
-        mut finish: impl FnMut(usize, &[f32], &[f32]),
+        slice: usize,
+        panels: Range<usize>,
+        sums: &mut AlignedBuffer<f32>,
+        mut finish: impl FnMut(usize, Product<'_>),
     ) {
-        let k = layer.weight.k();
-        block.resize(rows * self.columns());
+        sums.resize(rows * self.columns());
         for panel in panels {
-            let right = Panel::whole(layer.weight.panel_rows(panel, 0, k), k);
-            multiply_panel(self.simd, rows, left, right, block, self.columns(), false);
-            finish(panel, layer.panel_bias(self.simd, panel), block);
+            let right = layer.weight.panel(panel, slice);
+            multiply_panel(self.simd, layer.weight.format(), rows, left.rows, right, sums, self.columns());
+            let bias = Some(layer.panel_bias(self.simd, panel));
+            let codes = layer.weight.codes(panel, slice);
+            finish(panel, Product { rows, block: sums, codes, factors: left.factors, bias });
         }
     }
 }

@@ -4,6 +4,7 @@ use super::*;
 use crate::extract::CandleEncoder;
 use crate::extract::preset::Preset;
 use crate::extract::weights::{BlockWeights, Linear};
+use crate::kernels::SimdLevel;
 use crate::types::ImageSize;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -71,6 +72,18 @@ fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
 }
 
+fn cosine(a: &[f32], b: &[f32]) -> f64 {
+    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum::<f64>();
+    dot(a, b) / (dot(a, a) * dot(b, b)).sqrt()
+}
+
+/// Every precision of every level of this CPU.
+fn everything() -> impl Iterator<Item = (Simd, Precision)> {
+    let precisions = [Precision::F32, Precision::Bf16, Precision::Int8];
+    let all = Simd::all().flat_map(move |simd| precisions.map(|precision| (simd, precision)));
+    all.filter(|&(simd, precision)| choose_formats(simd, precision).is_ok())
+}
+
 #[test]
 fn equals_candle_at_every_level_size_and_exit() {
     let sizes = [(14, 14), (98, 70), (70, 126), (154, 98)].map(|(width, height)| ImageSize { width, height });
@@ -80,8 +93,8 @@ fn equals_candle_at_every_level_size_and_exit() {
         let spec = spec(size, exit, norm, attention);
         let image = image(seed as u64, size);
         let expected = &CandleEncoder::new(&weights, &spec).unwrap().encode(std::slice::from_ref(&image)).unwrap()[0];
-        for simd in Simd::all() {
-            let fused = FusedEncoder::new(&weights, spec, simd).unwrap();
+        for (simd, precision) in everything() {
+            let fused = FusedEncoder::new(&weights, spec, simd, precision).unwrap();
             let actual = &fused.encode(std::slice::from_ref(&image)).unwrap()[0];
             assert_eq!((actual.grid, actual.dim, actual.heads), (expected.grid, expected.dim, expected.heads));
             let differences = [
@@ -90,7 +103,15 @@ fn equals_candle_at_every_level_size_and_exit() {
                 largest_difference(&actual.cls_attention, &expected.cls_attention) * 100.0,
             ];
             let worst = differences.into_iter().fold(0.0, f32::max);
-            assert!(worst < 5e-4, "{} at {size}, exit {exit}: {differences:?}", fused.name());
+            // Random weights spread an error over all tokens; what trained ones lose is measured with the real model.
+            let (tolerance, least) = match precision {
+                Precision::Bf16 => (0.3, 0.999),
+                Precision::Int8 => (2.0, 0.995),
+                _ => (5e-4, 0.999_999),
+            };
+            assert!(worst < tolerance, "{} at {size}, exit {exit}: {differences:?}", fused.name());
+            let cosine = cosine(&actual.tokens, &expected.tokens);
+            assert!(cosine > least, "{} at {size}, exit {exit}: cosine {cosine}", fused.name());
         }
     }
 }
@@ -99,8 +120,8 @@ fn equals_candle_at_every_level_size_and_exit() {
 fn a_batch_gives_bit_for_bit_what_single_images_give() {
     let size = ImageSize { width: 112, height: 98 };
     let images: Vec<_> = (0..5).map(|seed| image(seed, size)).collect();
-    for simd in Simd::all() {
-        let fused = FusedEncoder::new(&small(9, true), spec(size, 2, false, 2), simd).unwrap();
+    for (simd, precision) in everything() {
+        let fused = FusedEncoder::new(&small(9, true), spec(size, 2, false, 2), simd, precision).unwrap();
         let together = fused.encode(&images).unwrap();
         let singly: Vec<_> =
             images.iter().flat_map(|image| fused.encode(std::slice::from_ref(image)).unwrap()).collect();
@@ -112,23 +133,39 @@ fn a_batch_gives_bit_for_bit_what_single_images_give() {
 #[test]
 fn a_broken_image_is_refused_and_leaves_no_trace() {
     let size = ImageSize { width: 112, height: 98 };
-    let fused = FusedEncoder::new(&small(3, true), spec(size, 1, false, 1), Simd::best()).unwrap();
-    let good = [image(1, size)];
-    let before = fused.encode(&good).unwrap();
-    let mut broken = image(2, size);
-    broken.data[5000] = f32::NAN;
-    assert!(matches!(fused.encode(&[broken]), Err(ExtractError::NotFinite)));
-    assert_eq!(fused.encode(&good).unwrap(), before);
-    let wrong = ImageTensor { size, data: vec![0.0; 7] };
-    assert!(matches!(fused.encode(&[wrong]), Err(ExtractError::WrongLength { .. })));
-    assert!(fused.encode(&[]).unwrap().is_empty());
+    for (simd, precision) in everything() {
+        let fused = FusedEncoder::new(&small(3, true), spec(size, 1, false, 1), simd, precision).unwrap();
+        let good = [image(1, size)];
+        let before = fused.encode(&good).unwrap();
+        let mut broken = image(2, size);
+        broken.data[5000] = f32::NAN;
+        assert!(matches!(fused.encode(&[broken]), Err(ExtractError::NotFinite)), "{}", fused.name());
+        assert_eq!(fused.encode(&good).unwrap(), before);
+        let wrong = ImageTensor { size, data: vec![0.0; 7] };
+        assert!(matches!(fused.encode(&[wrong]), Err(ExtractError::WrongLength { .. })));
+        assert!(fused.encode(&[]).unwrap().is_empty());
+    }
+}
+
+#[test]
+fn a_precision_without_its_instructions_is_refused_by_name() {
+    for simd in Simd::all() {
+        assert_eq!(choose_formats(simd, Precision::Auto).unwrap().0, Precision::F32);
+        if simd.level() == SimdLevel::Avx2 {
+            for precision in [Precision::Bf16, Precision::Int8] {
+                let refused = choose_formats(simd, precision).err().unwrap().to_string();
+                assert!(refused.contains(precision.name()) && refused.contains("level avx2"), "{refused}");
+            }
+        }
+    }
 }
 
 #[test]
 fn blocks_and_sizes_that_do_not_exist_are_refused() {
     let weights = small(4, true);
     let size = ImageSize { width: 28, height: 28 };
-    let build = |spec| FusedEncoder::new(&weights, spec, Simd::SCALAR).map(|_| ()).unwrap_err().to_string();
+    let build =
+        |spec| FusedEncoder::new(&weights, spec, Simd::SCALAR, Precision::F32).map(|_| ()).unwrap_err().to_string();
     assert!(build(spec(size, 3, false, 0)).contains("block 3"));
     assert!(build(spec(ImageSize { width: 30, height: 28 }, 0, false, 0)).contains("30x28"));
 }

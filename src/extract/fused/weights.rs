@@ -8,6 +8,7 @@
 use crate::extract::weights::{BlockWeights, Linear, Norm};
 use crate::kernels::Simd;
 use crate::kernels::gemm::{PackedMatrix, Tiling};
+use crate::kernels::operand::Format;
 
 /// A linear layer, packed.
 pub(super) struct PackedLinear {
@@ -18,13 +19,19 @@ pub(super) struct PackedLinear {
 }
 
 impl PackedLinear {
-    /// Packs y = W x + b after giving element `(out, in)` of W the factor `rows(out) * columns(in)`, b the factor
-    /// `rows(out)`, and b further what `shift` through W comes to.
-    fn pack(simd: Simd, layer: &Linear, rows: impl Fn(usize) -> f32, columns: Option<&Norm>) -> Self {
+    /// Packs y = W x + b, to be multiplied `slice` inputs at a time, after giving element `(out, in)` of W the factor
+    /// `rows(out) * columns(in)`, b the factor `rows(out)`, and b further what `shift` through W comes to.
+    fn pack(
+        (simd, format): (Simd, Format),
+        layer: &Linear,
+        slice: usize,
+        rows: impl Fn(usize) -> f32,
+        columns: Option<&Norm>,
+    ) -> Self {
         let (outputs, inputs) = (layer.bias.len(), layer.weight.len() / layer.bias.len());
         let scale = |input: usize| columns.map_or(1.0, |norm| norm.weight[input]);
-        let weight =
-            PackedMatrix::pack(simd, inputs, outputs, |i, o| layer.weight[o * inputs + i] * (rows(o) * scale(i)));
+        let element = |i: usize, o: usize| layer.weight[o * inputs + i] * (rows(o) * scale(i));
+        let weight = PackedMatrix::pack(simd, format, (inputs, outputs), slice.min(inputs), element);
         let shifted = |o: usize| {
             let row = &layer.weight[o * inputs..(o + 1) * inputs];
             let shift = columns.map_or(0.0, |norm| {
@@ -37,9 +44,9 @@ impl PackedLinear {
         Self { weight, bias }
     }
 
-    /// Packs a layer as it is.
+    /// Packs a layer as it is, in f32.
     pub fn plain(simd: Simd, layer: &Linear) -> Self {
-        Self::pack(simd, layer, |_| 1.0, None)
+        Self::pack((simd, Format::F32), layer, usize::MAX, |_| 1.0, None)
     }
 
     /// The biases of one panel.
@@ -62,15 +69,23 @@ pub(super) struct PackedBlock {
 }
 
 impl PackedBlock {
-    pub fn pack(simd: Simd, block: &BlockWeights, dim: usize, head_dim: usize) -> Self {
+    /// Packs a block whose hidden layer is computed `hidden_slice` numbers at a time.
+    pub fn pack(
+        kernels: (Simd, Format),
+        block: &BlockWeights,
+        dim: usize,
+        head_dim: usize,
+        hidden_slice: usize,
+    ) -> Self {
         let query_scale = std::f32::consts::LOG2_E / (head_dim as f32).sqrt();
         let scale = |layer_scale: &Option<Vec<f32>>, o: usize| layer_scale.as_ref().map_or(1.0, |scale| scale[o]);
         let query = |o: usize| if o < dim { query_scale } else { 1.0 };
+        let whole = usize::MAX;
         Self {
-            qkv: PackedLinear::pack(simd, &block.qkv, query, Some(&block.norm1)),
-            proj: PackedLinear::pack(simd, &block.proj, |o| scale(&block.layer_scale1, o), None),
-            fc1: PackedLinear::pack(simd, &block.fc1, |_| 1.0, Some(&block.norm2)),
-            fc2: PackedLinear::pack(simd, &block.fc2, |o| scale(&block.layer_scale2, o), None),
+            qkv: PackedLinear::pack(kernels, &block.qkv, whole, query, Some(&block.norm1)),
+            proj: PackedLinear::pack(kernels, &block.proj, whole, |o| scale(&block.layer_scale1, o), None),
+            fc1: PackedLinear::pack(kernels, &block.fc1, whole, |_| 1.0, Some(&block.norm2)),
+            fc2: PackedLinear::pack(kernels, &block.fc2, hidden_slice, |o| scale(&block.layer_scale2, o), None),
         }
     }
 

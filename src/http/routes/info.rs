@@ -3,6 +3,7 @@
 use super::match_images::SizeBody;
 use crate::http::AppState;
 use crate::http::problem::ApiError;
+use crate::types::Calibration;
 use axum::Json;
 use axum::extract::State;
 use serde::Serialize;
@@ -21,6 +22,8 @@ pub struct InfoBody {
     /// Scale combinations whose inliers add up to S.
     #[schema(example = json!(["1", "1+2", "2+3"]))]
     pub scales: Vec<String>,
+    /// What `matched` and `confidence` come from on maps without a calibration of their own; null: they are null there.
+    pub calibration: Option<Calibration>,
     /// Bounds and defaults of requests.
     pub limits: LimitsBody,
 }
@@ -57,6 +60,7 @@ pub async fn info(State(state): State<AppState>) -> Result<Json<InfoBody>, ApiEr
         model: info.model.to_string(),
         input_size: SizeBody { width: info.input_size.width, height: info.input_size.height },
         scales: info.rerank.scales.iter().map(ToString::to_string).collect(),
+        calibration: info.calibration,
         limits: LimitsBody {
             max_image_bytes: state.max_image_bytes,
             top_k: info.pipeline.top_k,

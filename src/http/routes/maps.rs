@@ -2,11 +2,13 @@
 
 use crate::error::ErrorCode;
 use crate::http::AppState;
+use crate::http::body::read_json;
 use crate::http::problem::ApiError;
 use crate::store::MapInfo;
-use crate::types::MapName;
+use crate::types::{Calibration, MapName};
 use axum::Json;
-use axum::extract::{Path, State};
+use axum::extract::{Path, Request, State};
+use axum::http::StatusCode;
 use serde::Serialize;
 use time::OffsetDateTime;
 use utoipa::ToSchema;
@@ -24,6 +26,8 @@ pub struct MapBody {
     /// When it was created.
     #[serde(with = "time::serde::rfc3339")]
     pub created_at: OffsetDateTime,
+    /// How far its best answers can be trusted; null: as far as the model's own calibration says, see `/info`.
+    pub calibration: Option<Calibration>,
 }
 
 impl From<MapInfo> for MapBody {
@@ -33,6 +37,7 @@ impl From<MapInfo> for MapBody {
             model: info.model.to_string(),
             references: info.references,
             created_at: info.created_at,
+            calibration: info.calibration,
         }
     }
 }
@@ -87,4 +92,35 @@ pub async fn get(State(state): State<AppState>, Path(map): Path<String>) -> Resu
 pub async fn delete(State(state): State<AppState>, Path(map): Path<String>) -> Result<Json<MapDeleted>, ApiError> {
     let references_deleted = state.service()?.delete_map(parse_name(&map)?).await?;
     Ok(Json(MapDeleted { references_deleted }))
+}
+
+/// Calibrate a map
+///
+/// From the next query on, `matched` and `confidence` come from this. `placeformer eval calibrate` fits it. It must
+/// have been fitted for the map's model and this server's re-ranking, else the answer is 409 with both identities.
+#[utoipa::path(put, path = "/maps/{map}/calibration", tag = "maps", request_body = Calibration,
+    params(("map" = String, Path, description = "The map's name.")), responses(
+    (status = 200, description = "The calibration as it is stored.", body = Calibration),
+))]
+pub async fn calibrate(
+    State(state): State<AppState>,
+    Path(map): Path<String>,
+    request: Request,
+) -> Result<Json<Calibration>, ApiError> {
+    let service = state.service()?;
+    let calibration: Calibration = read_json(&state, request).await?;
+    service.set_calibration(parse_name(&map)?, Some(calibration.clone())).await?;
+    Ok(Json(calibration))
+}
+
+/// Remove a map's calibration
+///
+/// The model's own is in force again, if it has one.
+#[utoipa::path(delete, path = "/maps/{map}/calibration", tag = "maps",
+    params(("map" = String, Path, description = "The map's name.")), responses(
+    (status = 204, description = "The map has no calibration of its own."),
+))]
+pub async fn uncalibrate(State(state): State<AppState>, Path(map): Path<String>) -> Result<StatusCode, ApiError> {
+    state.service()?.set_calibration(parse_name(&map)?, None).await?;
+    Ok(StatusCode::NO_CONTENT)
 }

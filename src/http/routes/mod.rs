@@ -22,6 +22,7 @@ pub fn all() -> OpenApiRouter<AppState> {
         .routes(routes!(match_images::match_images))
         .routes(routes!(maps::list))
         .routes(routes!(maps::get, maps::delete))
+        .routes(routes!(maps::calibrate, maps::uncalibrate))
         .routes(routes!(info::info))
         .routes(routes!(ops::livez))
         .routes(routes!(ops::readyz))

@@ -84,6 +84,12 @@ pub struct QueryAnswerBody {
     pub results: Vec<QueryResultBody>,
     /// Whether the order comes from re-ranking; else it is the order of global distance.
     pub reranked: bool,
+    /// Whether the first result is trusted: its confidence reaches the threshold of the map's calibration, else of the
+    /// model's. False without any result; null if there is no calibration.
+    pub matched: Option<bool>,
+    /// Probability that the first result shows the right place; 0 without any result; null if there is no calibration.
+    #[schema(minimum = 0, maximum = 1, example = 0.97)]
+    pub confidence: Option<f64>,
     /// Milliseconds per stage, as in the `Server-Timing` header.
     #[schema(value_type = std::collections::HashMap<String, f64>, example = json!({"decode": 6.1, "extract": 210.0, "rerank": 44.9}))]
     pub timings_ms: BTreeMap<&'static str, f64>,
@@ -192,6 +198,8 @@ fn respond(answer: QueryAnswer) -> Response {
     let body = QueryAnswerBody {
         results: results.map(|(position, result)| QueryResultBody::new(position, result)).collect(),
         reranked: answer.reranked,
+        matched: answer.verdict.matched,
+        confidence: answer.verdict.confidence,
         timings_ms: timings_ms(&answer.timings),
         model: answer.model.to_string(),
     };

@@ -4,7 +4,7 @@ use super::engine::failed;
 use super::insert::{number_of_external, remove, write_row};
 use super::rows::{self, MapRow, REFERENCE_COLUMNS, REFERENCE_SOURCE, ReferenceRow, RowError};
 use crate::store::{ReferencePatch, StoreError, apply_patch};
-use crate::types::{ContentHash, MapName, ModelId, Reference, ReferenceFields, ReferenceId};
+use crate::types::{Calibration, ContentHash, MapName, ModelId, Reference, ReferenceFields, ReferenceId};
 use rusqlite::{Connection, params};
 use time::OffsetDateTime;
 
@@ -83,14 +83,19 @@ pub(super) fn delete_map(connection: &Connection, name: &MapName) -> Result<(i64
     Ok((deleted.0, deleted.1.max(0) as u64))
 }
 
-/// Stores or clears a map's calibration.
+/// Stores a map's calibration, or clears it.
 pub(super) fn set_calibration(
     connection: &Connection,
     name: &MapName,
-    calibration: Option<String>,
+    calibration: Option<&Calibration>,
 ) -> Result<(), StoreError> {
     let mut map = MapRow::require(connection, name)?;
-    map.calibration = calibration;
+    // Checked where the map's model cannot change meanwhile.
+    if let Some(given) = calibration.map(Calibration::model).filter(|given| **given != map.model) {
+        return Err(StoreError::CalibrationMismatch { map: name.clone(), bound: map.model, given: given.clone() });
+    }
+    // A struct of strings and finite numbers always serialises.
+    map.calibration = calibration.and_then(|calibration| serde_json::to_string(calibration).ok());
     map.save(connection)
 }
 

@@ -34,7 +34,7 @@ use self::writer::{Effect, Pending, Writer};
 use super::{
     GlobalRow, Inserted, MapInfo, Page, PlaceStore, Quarantined, ReferencePatch, StoreConfig, StoreError, VerifyReport,
 };
-use crate::types::{ExternalId, MapName, ModelId, NewReference, PackedPatches, Reference, ReferenceId};
+use crate::types::{Calibration, ExternalId, MapName, ModelId, NewReference, PackedPatches, Reference, ReferenceId};
 use std::path::{Path, PathBuf};
 
 /// A store in one directory, shared by all threads of one process.
@@ -97,7 +97,8 @@ impl SqliteStore {
 
     fn info(&self, map: MapRow) -> MapInfo {
         let references = (map.reference_count.max(0) as u64).saturating_sub(self.quarantine.count(map.number));
-        MapInfo { name: map.name, model: map.model, references, created_at: map.created_at }
+        let calibration = map.calibration();
+        MapInfo { name: map.name, model: map.model, references, created_at: map.created_at, calibration }
     }
 }
 
@@ -194,15 +195,10 @@ impl PlaceStore for SqliteStore {
         self.exchange_head(map, new_model, compute)
     }
 
-    fn calibration(&self, map: &MapName) -> Result<Option<serde_json::Value>, StoreError> {
-        let map = self.readers.with(|connection| MapRow::require(connection, map))?;
-        let damaged = |_| StoreError::CorruptMap { map: map.name.to_string() };
-        map.calibration.as_deref().map(serde_json::from_str).transpose().map_err(damaged)
-    }
-
-    fn set_calibration(&self, map: &MapName, calibration: Option<serde_json::Value>) -> Result<(), StoreError> {
-        let (map, text) = (map.clone(), calibration.map(|value| value.to_string()));
-        self.writer.run(Effect::Grows(1024), move |connection| change::set_calibration(connection, &map, text.clone()))
+    fn set_calibration(&self, map: &MapName, calibration: Option<Calibration>) -> Result<(), StoreError> {
+        let map = map.clone();
+        self.writer
+            .run(Effect::Grows(2048), move |connection| change::set_calibration(connection, &map, calibration.as_ref()))
     }
 
     fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError> {

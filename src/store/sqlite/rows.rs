@@ -6,7 +6,9 @@
 
 use super::engine::{damage, failed};
 use crate::store::{StoreError, codec};
-use crate::types::{ContentHash, GeoPoint, Heading, MapName, ModelId, Reference, ReferenceFields, ReferenceId};
+use crate::types::{
+    Calibration, ContentHash, GeoPoint, Heading, MapName, ModelId, Reference, ReferenceFields, ReferenceId,
+};
 use rusqlite::{Connection, OptionalExtension, Row, params};
 use time::{OffsetDateTime, UtcOffset};
 
@@ -155,6 +157,15 @@ impl MapRow {
             }
         }
         Ok((maps, damaged))
+    }
+
+    /// The map's calibration, if it has one that this release can read. Its bytes are as they were written (the row's
+    /// checksum says so), so one that cannot be read comes from another release: the map goes on without it.
+    pub(super) fn calibration(&self) -> Option<Calibration> {
+        let text = self.calibration.as_deref()?;
+        serde_json::from_str(text)
+            .inspect_err(|error| tracing::warn!(map = %self.name, %error, "the map's calibration cannot be read"))
+            .ok()
     }
 
     /// Writes the covered columns back after a change.

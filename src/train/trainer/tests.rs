@@ -1,5 +1,6 @@
 use super::*;
 use crate::train::head::{HeadModel, PooledTokens};
+use crate::train::{Augmentation, Schedule};
 
 const DIM: usize = 16;
 
@@ -60,7 +61,7 @@ fn train_in(
             std::panic::panic_any("interrupted");
         }
     };
-    let session = Session { folder: folder.to_owned(), progress: &mut progress };
+    let session = Session { folder: folder.to_owned(), identity: "test".into(), progress: &mut progress };
     let run = std::panic::AssertUnwindSafe(|| model.train(set, &validation, config, session).unwrap());
     std::panic::catch_unwind(run).ok()
 }
@@ -99,13 +100,14 @@ fn a_checkpoint_of_other_settings_or_a_broken_one_is_refused() {
     train_in(folder.path(), &head(&tokens), &set, &config(40), u64::MAX).unwrap();
     let mut progress = |_: &CycleRecord| {};
     let validation = set.clone();
-    let mut attempt = |config: &TrainConfig| {
-        let session = Session { folder: folder.path().to_owned(), progress: &mut progress };
+    let mut attempt = |config: &TrainConfig, identity: &str| {
+        let session = Session { folder: folder.path().to_owned(), identity: identity.into(), progress: &mut progress };
         head(&tokens).train(&set, &validation, config, session).unwrap_err().to_string()
     };
-    assert!(attempt(&config(60)).contains("other settings"));
+    assert!(attempt(&config(60), "test").contains("other settings"));
+    assert!(attempt(&config(40), "other data").contains("other data"));
     std::fs::write(folder.path().join("checkpoint.safetensors"), b"torn").unwrap();
-    assert!(attempt(&config(40)).contains("not readable"));
+    assert!(attempt(&config(40), "test").contains("not readable"));
 }
 
 #[test]

@@ -1,8 +1,11 @@
-//! Measure recall on a data set.
+//! Measure recall on a data set, or calibrate confidences on it.
 
+mod calibrate;
+
+use super::data_args::ReadArgs;
 use super::model_args::ModelOptions;
 use crate::eval::ablate::{Base, ablate};
-use crate::eval::datasets::{self, Dataset, DatasetKind, DatasetOptions, Split};
+use crate::eval::datasets::{self, Dataset, DatasetKind, DatasetOptions};
 use crate::eval::features::{Describe, FeatureCache, Features, GlobalKind, ModelDescriber};
 use crate::eval::report::{Painter, gallery};
 use crate::eval::run::{Answer, QuerySeconds, rerank_all, search_all};
@@ -18,7 +21,32 @@ use std::path::{Path, PathBuf};
 
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 pub struct EvalArgs {
+    #[command(subcommand)]
+    action: Option<Action>,
+    #[command(flatten)]
+    measure: MeasureArgs,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Action {
+    /// Fit how far best answers can be trusted.
+    ///
+    /// Every query is answered as the service would, and two curves are fitted to what the best answers were worth:
+    /// one on S and global distance for re-ranked answers, one on the distance alone for the others. An answer is
+    /// trusted from the confidence on at which the share of right ones reaches --target-precision (cross-validated,
+    /// never below 0.5).
+    ///
+    /// Queries without a match come from the ground truth (an empty reference). Where it has none, every query is
+    /// asked twice, the second time with its own place left out of the database: its positives and, where positions
+    /// are known, all images within four times the radius. Confidences hold for the mix of known and unknown places
+    /// they were fitted on; half and half is what leaving out gives.
+    Calibrate(Box<calibrate::CalibrateArgs>),
+}
+
+#[derive(Debug, clap::Args)]
+struct MeasureArgs {
     #[command(flatten)]
     data: DataArgs,
     #[command(flatten)]
@@ -48,9 +76,8 @@ struct DataArgs {
     /// Where that data set lies.
     #[arg(long, value_name = "DIR", requires = "dataset")]
     root: Option<PathBuf>,
-    /// Part of the data set [default: test; val for MSLS; train for RobotCar, whose test poses are withheld].
-    #[arg(long, value_enum)]
-    split: Option<Split>,
+    #[command(flatten)]
+    reading: ReadArgs,
     /// Greatest distance of a positive in metres.
     #[arg(long, default_value_t = 25.0, value_name = "METRES")]
     radius: f64,
@@ -60,12 +87,6 @@ struct DataArgs {
     /// Greatest frame distance of a positive (Nordland).
     #[arg(long, default_value_t = 10, value_name = "FRAMES")]
     frame_tolerance: u64,
-    /// Only these cities (MSLS).
-    #[arg(long, value_delimiter = ',', value_name = "CITY,...")]
-    cities: Vec<String>,
-    /// Task of MSLS: all, s2w, w2s, o2n, n2o, d2n, n2d.
-    #[arg(long, default_value = "all")]
-    subtask: String,
 }
 
 /// What is done to the images.
@@ -75,15 +96,11 @@ struct MethodArgs {
     /// What is searched: the head's output, or the mean patch token before it.
     #[arg(long, value_enum, default_value = "head")]
     global: GlobalKind,
-    /// Candidates that are re-ranked.
-    #[arg(long, default_value_t = 100, value_name = "N")]
-    candidates: usize,
+    #[command(flatten)]
+    rerank: RerankArgs,
     /// Leave re-ranking out.
     #[arg(long)]
     no_rerank: bool,
-    /// Scale combinations whose inliers add up to S.
-    #[arg(long, value_delimiter = ',', default_value = "1,1+2,2+3", value_name = "SET,...")]
-    scales: Vec<ScaleSet>,
     /// Repeat along the axes of the paper's ablation tables.
     #[arg(long)]
     ablate: bool,
@@ -96,6 +113,18 @@ struct MethodArgs {
     /// Seed of the bootstrap.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+}
+
+/// How candidates are re-ranked.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Method")]
+struct RerankArgs {
+    /// Candidates that are re-ranked.
+    #[arg(long, default_value_t = 100, value_name = "N")]
+    candidates: usize,
+    /// Scale combinations whose inliers add up to S.
+    #[arg(long, value_delimiter = ',', default_value = "1,1+2,2+3", value_name = "SET,...")]
+    scales: Vec<ScaleSet>,
 }
 
 /// Where results go.
@@ -114,6 +143,14 @@ struct OutputArgs {
     /// Write the benchmark's prediction file (MSLS, RobotCar Seasons).
     #[arg(long, value_name = "FILE")]
     predictions: Option<PathBuf>,
+    #[command(flatten)]
+    cache: CacheArgs,
+}
+
+/// Where descriptors are kept.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Output")]
+struct CacheArgs {
     /// Folder where descriptors are kept between runs.
     #[arg(long, value_name = "DIR")]
     cache: Option<PathBuf>,
@@ -125,9 +162,15 @@ struct OutputArgs {
 /// Runs it.
 pub fn run(args: EvalArgs) -> anyhow::Result<()> {
     crate::kernels::self_check()?;
-    ensure!(args.method.candidates > 0, "--candidates must be at least 1");
+    match args.action {
+        Some(Action::Calibrate(args)) => calibrate::run(*args),
+        None => run_measure(args.measure),
+    }
+}
+
+fn run_measure(args: MeasureArgs) -> anyhow::Result<()> {
+    args.method.rerank.check()?;
     let dataset = args.data.load()?;
-    eprintln!("{}: {} references, {} queries", dataset.name, dataset.database.len(), dataset.queries.len());
     let extract = args.model.extract_config()?;
     let measured = measure(&args, &dataset, &extract)?;
     print!("{}", report::text(&measured.summary));
@@ -147,7 +190,7 @@ pub fn run(args: EvalArgs) -> anyhow::Result<()> {
     }
     if let Some(path) = &args.output.html {
         let limits = ImageConfig::default();
-        let reranker = Reranker::new(args.method.rerank_config());
+        let reranker = Reranker::new(args.method.rerank.config());
         let painter = Painter { extractor: &measured.extractor, limits: &limits, reranker: &reranker };
         details += &gallery(&painter, &dataset, &measured.answers, args.output.pictures)?;
         write(path, &report::html(&measured.summary, &dataset, &measured.answers, &details))?;
@@ -164,23 +207,23 @@ fn write(path: &Path, text: &str) -> anyhow::Result<()> {
 impl DataArgs {
     fn load(&self) -> anyhow::Result<Dataset> {
         let options = DatasetOptions {
-            split: self.split,
             radius_m: self.radius,
             max_angle_deg: self.max_angle,
             frame_tolerance: self.frame_tolerance,
-            cities: self.cities.clone(),
-            subtask: self.subtask.clone(),
+            ..self.reading.options()
         };
-        Ok(match (&self.database, &self.queries, &self.ground_truth, self.dataset, &self.root) {
+        let dataset = match (&self.database, &self.queries, &self.ground_truth, self.dataset, &self.root) {
             (Some(database), Some(queries), Some(truth), ..) => datasets::load_pairs(database, queries, truth)?,
             (_, _, _, Some(kind), Some(root)) => datasets::load(kind, root, &options)?,
             _ => bail!("give --dataset and --root, or --database, --queries and --ground-truth"),
-        })
+        };
+        eprintln!("{}: {} references, {} queries", dataset.name, dataset.database.len(), dataset.queries.len());
+        Ok(dataset)
     }
 }
 
-impl OutputArgs {
-    fn cache_folder(&self) -> anyhow::Result<PathBuf> {
+impl CacheArgs {
+    fn folder(&self) -> anyhow::Result<PathBuf> {
         match &self.cache {
             Some(folder) => Ok(folder.clone()),
             None => Ok(crate::extract::pull::cache_dir()?.join("eval")),
@@ -188,8 +231,13 @@ impl OutputArgs {
     }
 }
 
-impl MethodArgs {
-    fn rerank_config(&self) -> RerankConfig {
+impl RerankArgs {
+    fn check(&self) -> anyhow::Result<()> {
+        ensure!(self.candidates > 0, "--candidates must be at least 1");
+        Ok(())
+    }
+
+    fn config(&self) -> RerankConfig {
         RerankConfig { scales: self.scales.clone(), ..Default::default() }
     }
 }
@@ -204,48 +252,67 @@ fn describer(model: &ModelOptions, config: &ExtractConfig) -> anyhow::Result<Mod
     Ok(ModelDescriber { extractor: model.open(config)?, limits: ImageConfig::default() })
 }
 
-fn measure(args: &EvalArgs, dataset: &Dataset, extract: &ExtractConfig) -> anyhow::Result<Measured> {
-    let describer = describer(&args.model, extract)?;
-    let cache = FeatureCache::open(&args.output.cache_folder()?, describer.model(), args.output.patch_memory << 20)?;
-    let images = (dataset.database.len() + dataset.queries.len()) as u64;
-    let bar = bar(images, "describing");
-    let side = |items, name| cache.describe_all(&describer, items, name, args.method.global, &bar);
-    let (database, queries) = (side(&dataset.database, "database")?, side(&dataset.queries, "query")?);
-    bar.finish_and_clear();
-    let cached = dataset.database.len() + dataset.queries.len() - database.fresh - queries.fresh;
-    eprintln!("described {} images, {cached} more were cached or unreadable", database.fresh + queries.fresh);
-    let (answers, seconds) = answer_all(args, &cache, &database, &queries)?;
+/// Both sides of a data set, described.
+struct Described {
+    extractor: Extractor,
+    cache: FeatureCache,
+    database: Features,
+    queries: Features,
+}
+
+impl Described {
+    fn new(
+        model: &ModelOptions,
+        extract: &ExtractConfig,
+        cache: &CacheArgs,
+        dataset: &Dataset,
+        global: GlobalKind,
+    ) -> anyhow::Result<Self> {
+        let describer = describer(model, extract)?;
+        let cache = FeatureCache::open(&cache.folder()?, &describer, cache.patch_memory << 20)?;
+        let images = dataset.database.len() + dataset.queries.len();
+        let bar = bar(images as u64, "describing");
+        let side = |items, name| cache.describe_all(&describer, items, name, global, &bar);
+        let (database, queries) = (side(&dataset.database, "database")?, side(&dataset.queries, "query")?);
+        bar.finish_and_clear();
+        let fresh = database.fresh + queries.fresh;
+        eprintln!("described {fresh} images, {} more were cached or unreadable", images - fresh);
+        Ok(Self { extractor: describer.extractor, cache, database, queries })
+    }
+
+    fn rerank(&self, answers: Vec<Answer>, config: &RerankConfig) -> anyhow::Result<(Vec<Answer>, QuerySeconds)> {
+        let bar = bar(answers.len() as u64, "re-ranking");
+        let patches = |features: &Features, index| self.cache.patches(features, index);
+        let reranked = rerank_all(&patches, &self.database, &self.queries, answers, config, &bar)?;
+        bar.finish_and_clear();
+        Ok(reranked)
+    }
+}
+
+fn measure(args: &MeasureArgs, dataset: &Dataset, extract: &ExtractConfig) -> anyhow::Result<Measured> {
+    let described = Described::new(&args.model, extract, &args.output.cache, dataset, args.method.global)?;
+    let candidates = args.method.rerank.candidates;
+    let (answers, search) = search_all(&described.database, &described.queries, |_| candidates);
+    let (answers, seconds) = match args.method.no_rerank {
+        true => (answers, QuerySeconds::default()),
+        false => described.rerank(answers, &args.method.rerank.config())?,
+    };
+    let seconds = QuerySeconds { search, ..seconds };
     let config = RunConfig {
-        model: describer.model().clone(),
+        model: described.extractor.model_id().clone(),
         global: args.method.global,
-        candidates: args.method.candidates,
-        extract: describer.extractor.config().clone(),
-        rerank: (!args.method.no_rerank).then(|| args.method.rerank_config()),
+        candidates,
+        extract: described.extractor.config().clone(),
+        rerank: (!args.method.no_rerank).then(|| args.method.rerank.config()),
         bootstrap: args.method.bootstrap,
         seed: args.method.seed,
     };
+    let Described { extractor, database, queries, .. } = described;
     let summary = summarise(dataset, &database, &queries, &answers, seconds, config)?;
-    Ok(Measured { extractor: describer.extractor, answers, summary })
+    Ok(Measured { extractor, answers, summary })
 }
 
-fn answer_all(
-    args: &EvalArgs,
-    cache: &FeatureCache,
-    database: &Features,
-    queries: &Features,
-) -> anyhow::Result<(Vec<Answer>, QuerySeconds)> {
-    let (answers, search) = search_all(database, queries, args.method.candidates);
-    if args.method.no_rerank {
-        return Ok((answers, QuerySeconds { search, ..Default::default() }));
-    }
-    let bar = bar(answers.len() as u64, "re-ranking");
-    let patches = |features: &Features, index| cache.patches(features, index);
-    let (answers, seconds) = rerank_all(&patches, database, queries, answers, &args.method.rerank_config(), &bar)?;
-    bar.finish_and_clear();
-    Ok((answers, QuerySeconds { search, ..seconds }))
-}
-
-fn write_predictions(path: &Path, args: &EvalArgs, dataset: &Dataset, answers: &[Answer]) -> anyhow::Result<()> {
+fn write_predictions(path: &Path, args: &MeasureArgs, dataset: &Dataset, answers: &[Answer]) -> anyhow::Result<()> {
     match args.data.dataset {
         Some(DatasetKind::MslsTest | DatasetKind::MslsVal) => prediction::write_msls(path, dataset, answers)?,
         Some(DatasetKind::RobotcarSeasonsV2) => prediction::write_robotcar(path, dataset, answers)?,
@@ -256,20 +323,20 @@ fn write_predictions(path: &Path, args: &EvalArgs, dataset: &Dataset, answers: &
 }
 
 fn run_ablation(
-    args: &EvalArgs,
+    args: &MeasureArgs,
     dataset: &Dataset,
     extract: &ExtractConfig,
 ) -> anyhow::Result<Vec<crate::eval::ablate::AblationRow>> {
-    let rerank = args.method.rerank_config();
+    let rerank = args.method.rerank.config();
     let mut backbones = vec![extract.preset];
     backbones.extend(args.method.backbones.iter().filter(|&&preset| preset != extract.preset));
     let base = Base {
         extract,
         rerank: &rerank,
-        candidates: args.method.candidates,
+        candidates: args.method.rerank.candidates,
         backbones: &backbones,
-        cache: &args.output.cache_folder()?,
-        memory_bytes: args.output.patch_memory << 20,
+        cache: &args.output.cache.folder()?,
+        memory_bytes: args.output.cache.patch_memory << 20,
     };
     let open = |config: &ExtractConfig| -> Result<Box<dyn Describe>, EvalError> {
         let describer = describer(&args.model, config).map_err(|error| EvalError::Setting(format!("{error:#}")))?;

@@ -1,0 +1,226 @@
+//! `POST /query` through a server of this process, over loopback.
+
+use super::peers::{PeerRow, Peers};
+use crate::bench::filled::FilledStore;
+use crate::bench::{fill_with_streets, scenes::street, street_map};
+use crate::cli::serve::{Loaders, run_server};
+use crate::config::Config;
+use crate::extract::Extractor;
+use crate::ops::memory::resident_bytes;
+use crate::store::{SqliteStore, StoreConfig};
+use crate::types::ImageSize;
+use anyhow::{Context, ensure};
+use hdrhistogram::Histogram;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+use tokio::net::TcpListener;
+use tokio::sync::oneshot;
+
+/// Different query photos, sent in turn.
+const PHOTOS: u64 = 32;
+const PHOTO_SIZE: ImageSize = ImageSize { width: 1280, height: 720 };
+
+/// What to measure.
+pub(super) struct EndToEnd<'a> {
+    pub(super) references: &'a [u64],
+    pub(super) drawn: u64,
+    pub(super) clients: &'a [usize],
+    pub(super) seconds: f64,
+    pub(super) extractor: Arc<Extractor>,
+    pub(super) folder: &'a Path,
+    /// Python with the peers' packages and the weights' file, to measure the peers too.
+    pub(super) peers: Option<(&'a Path, &'a Path)>,
+}
+
+/// One measurement.
+#[derive(Debug, Serialize)]
+pub(super) struct EndToEndRow {
+    /// References of the map.
+    pub(super) references: u64,
+    /// Clients that ask one query after the other.
+    pub(super) clients: usize,
+    /// Answers received.
+    pub(super) queries: u64,
+    pub(super) p50_ms: f64,
+    pub(super) p99_ms: f64,
+    pub(super) queries_per_second: f64,
+    /// Median of each stage as the answers tell it.
+    pub(super) stages_ms: BTreeMap<String, f64>,
+    /// Resident memory of server and clients together at the end.
+    pub(super) resident_bytes: u64,
+    /// What users assemble today, with one client and no HTTP between.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) peer: Option<PeerRow>,
+}
+
+impl EndToEnd<'_> {
+    pub(super) fn measure(&self) -> anyhow::Result<Vec<EndToEndRow>> {
+        let directory = self.folder.join("end-to-end");
+        println!("drawing and describing {} references", self.drawn);
+        let store = SqliteStore::open(&directory, &StoreConfig::default())?;
+        fill_with_streets(&store, &self.extractor, self.drawn)?;
+        drop(store);
+        let photos: Vec<Vec<u8>> =
+            (0..PHOTOS).map(|place| street(place * 7, 1, PHOTO_SIZE)).collect::<Result<_, _>>()?;
+        let photos: Arc<[bytes::Bytes]> = photos.into_iter().map(bytes::Bytes::from).collect();
+        let prepare = |(python, weights)| {
+            let drawn = (self.drawn, crate::bench::REFERENCE_SIZE);
+            Peers::prepare(python, self.folder, (&self.extractor, weights), drawn, &photos)
+        };
+        let peers = self.peers.map(prepare).transpose()?;
+        let runtime = tokio::runtime::Runtime::new()?;
+        let mut rows: Vec<EndToEndRow> = Vec::new();
+        for &references in self.references {
+            ensure!(references >= self.drawn, "--references {references} are fewer than --drawn {}", self.drawn);
+            let mut measured = runtime.block_on(self.at(references, &directory, &photos))?;
+            if let (Some(peers), Some(row)) = (&peers, measured.first_mut()) {
+                println!("{references} references, the peers");
+                row.peer = Some(peers.measure(references, self.seconds)?);
+            }
+            rows.extend(measured);
+        }
+        Ok(rows)
+    }
+
+    /// All numbers of clients on one server.
+    async fn at(
+        &self,
+        references: u64,
+        directory: &Path,
+        photos: &Arc<[bytes::Bytes]>,
+    ) -> anyhow::Result<Vec<EndToEndRow>> {
+        let listener = TcpListener::bind("127.0.0.1:0").await?;
+        let url = format!("http://{}", listener.local_addr()?);
+        let (stop, stopped) = oneshot::channel::<()>();
+        let (extra, directory, extractor) =
+            (references - self.drawn, directory.to_owned(), Arc::clone(&self.extractor));
+        let loaders = Loaders {
+            source: Box::new(move || Ok(extractor)),
+            store: Box::new(move || {
+                Ok(Arc::new(FilledStore::new(SqliteStore::open(&directory, &StoreConfig::default())?, extra)?))
+            }),
+        };
+        let serving = tokio::spawn(run_server(listener, Config::default(), loaders, async {
+            let _ = stopped.await;
+        }));
+        let client = reqwest::Client::builder().timeout(Duration::from_secs(60)).build()?;
+        wait_until_ready(&client, &url).await?;
+        let mut rows = Vec::new();
+        for &clients in self.clients {
+            println!("{references} references, {clients} clients");
+            let asked = ask(&client, &url, photos, clients, Duration::from_secs_f64(self.seconds)).await?;
+            rows.push(asked.row(references, clients, self.seconds));
+        }
+        // The server may have ended with an error, which the next line tells.
+        let _ = stop.send(());
+        serving.await.context("the server panicked")??;
+        Ok(rows)
+    }
+}
+
+async fn wait_until_ready(client: &reqwest::Client, url: &str) -> anyhow::Result<()> {
+    let started = Instant::now();
+    loop {
+        let answer = client.get(format!("{url}/readyz")).send().await;
+        if answer.as_ref().is_ok_and(|answer| answer.status().is_success()) {
+            return Ok(());
+        }
+        ensure!(started.elapsed() < Duration::from_secs(300), "the server is not ready: {answer:?}");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
+/// Answers of one measurement.
+struct Asked {
+    latency: Histogram<u64>,
+    stages: BTreeMap<String, Histogram<u64>>,
+}
+
+impl Default for Asked {
+    fn default() -> Self {
+        Self { latency: histogram(), stages: BTreeMap::new() }
+    }
+}
+
+/// Microseconds, growing as needed.
+fn histogram() -> Histogram<u64> {
+    // Cannot fail: three digits are within the crate's documented bounds.
+    Histogram::new(3).expect("constant digits are valid")
+}
+
+impl Asked {
+    fn add(&mut self, latency: Duration, timings: &serde_json::Value) -> anyhow::Result<()> {
+        self.latency.record(latency.as_micros() as u64)?;
+        for (stage, ms) in timings.as_object().into_iter().flatten() {
+            let micros = ms.as_f64().unwrap_or_default() * 1e3;
+            self.stages.entry(stage.clone()).or_insert_with(histogram).record(micros as u64)?;
+        }
+        Ok(())
+    }
+
+    fn row(&self, references: u64, clients: usize, seconds: f64) -> EndToEndRow {
+        let at = |histogram: &Histogram<u64>, quantile| histogram.value_at_quantile(quantile) as f64 / 1e3;
+        EndToEndRow {
+            references,
+            clients,
+            queries: self.latency.len(),
+            p50_ms: at(&self.latency, 0.5),
+            p99_ms: at(&self.latency, 0.99),
+            queries_per_second: self.latency.len() as f64 / seconds,
+            stages_ms: self.stages.iter().map(|(stage, times)| (stage.clone(), at(times, 0.5))).collect(),
+            resident_bytes: resident_bytes().unwrap_or_default(),
+            peer: None,
+        }
+    }
+}
+
+/// Closed loop: each client asks again as soon as it is answered, until `time` is over. The first answers are not
+/// counted: they warm connections and caches.
+async fn ask(
+    client: &reqwest::Client,
+    url: &str,
+    photos: &Arc<[bytes::Bytes]>,
+    clients: usize,
+    time: Duration,
+) -> anyhow::Result<Asked> {
+    let url = format!("{url}/query?map={}&deadline_ms=60000", street_map());
+    for photo in photos.iter().take(2) {
+        query(client, &url, photo.clone()).await?;
+    }
+    let (asked, until) = (Arc::new(Mutex::new(Asked::default())), Instant::now() + time);
+    let tasks = (0..clients).map(|number| {
+        let (client, url, photos, asked) = (client.clone(), url.clone(), Arc::clone(photos), Arc::clone(&asked));
+        tokio::spawn(async move {
+            for photo in photos.iter().cycle().skip(number * 5) {
+                if Instant::now() >= until {
+                    break;
+                }
+                let (latency, timings) = query(&client, &url, photo.clone()).await?;
+                asked.lock().unwrap_or_else(PoisonError::into_inner).add(latency, &timings)?;
+            }
+            anyhow::Ok(())
+        })
+    });
+    for task in tasks.collect::<Vec<_>>() {
+        task.await??;
+    }
+    Ok(std::mem::take(&mut *asked.lock().unwrap_or_else(PoisonError::into_inner)))
+}
+
+async fn query(
+    client: &reqwest::Client,
+    url: &str,
+    photo: bytes::Bytes,
+) -> anyhow::Result<(Duration, serde_json::Value)> {
+    let started = Instant::now();
+    let answer = client.post(url).header("content-type", "image/jpeg").body(photo).send().await?;
+    let status = answer.status();
+    let mut body: serde_json::Value = answer.json().await?;
+    let latency = started.elapsed();
+    ensure!(status.is_success(), "{status}: {body}");
+    ensure!(body["reranked"] == true, "an answer was not re-ranked");
+    Ok((latency, body["timings_ms"].take()))
+}

@@ -1,0 +1,162 @@
+//! Measure every stage beside its baselines.
+
+mod end_to_end;
+mod peers;
+mod table;
+
+use super::model_args::ModelOptions;
+use crate::bench::{Bench, BenchError, Limits, NAMES, Row};
+use crate::extract::{ExtractError, Extractor, VitWeights};
+use crate::kernels;
+use anyhow::{Context, ensure};
+use end_to_end::{EndToEnd, EndToEndRow};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Arguments of this subcommand.
+#[derive(Debug, clap::Args)]
+pub struct BenchArgs {
+    /// Rows to measure, such as extract,search_1m; all but search_10m (14 GB) unless given.
+    #[arg(long, value_name = "NAME,..", value_delimiter = ',')]
+    only: Vec<String>,
+    /// Paired runs of the slow rows; quick ones take more.
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..))]
+    rounds: u32,
+    /// Also write the result as JSON.
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Measure POST /query through a server instead, at every number of clients and references.
+    #[arg(long)]
+    end_to_end: bool,
+    /// References of the map, with --end-to-end; random ones beyond the drawn.
+    #[arg(long, value_delimiter = ',', default_values_t = [1_000, 100_000, 1_000_000], requires = "end_to_end")]
+    references: Vec<u64>,
+    /// Drawn references with patches, with --end-to-end.
+    #[arg(long, default_value_t = 1_000, requires = "end_to_end")]
+    drawn: u64,
+    /// Clients that ask one query after the other, with --end-to-end.
+    #[arg(long, value_delimiter = ',', default_values_t = [1, 8], requires = "end_to_end")]
+    clients: Vec<usize>,
+    /// Seconds of each measurement, with --end-to-end.
+    #[arg(long, default_value_t = 20.0, requires = "end_to_end")]
+    seconds: f64,
+    /// Also measure what users assemble today (OpenVINO, faiss, numpy, OpenCV) with this Python, which needs
+    /// benches/peers/requirements.txt.
+    #[arg(long, value_name = "PYTHON", requires = "end_to_end")]
+    peers: Option<PathBuf>,
+    /// Keep the drawn references here, to measure again sooner; a temporary folder otherwise.
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
+    #[command(flatten)]
+    model: ModelOptions,
+}
+
+/// What a run found, as written by `--json`.
+#[derive(Debug, Serialize)]
+struct Report {
+    version: &'static str,
+    simd: String,
+    threads: usize,
+    encoder: String,
+    limits: Limits,
+    rows: Vec<Row>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    end_to_end: Vec<EndToEndRow>,
+}
+
+/// Runs it.
+pub fn run(args: BenchArgs) -> anyhow::Result<()> {
+    if cfg!(debug_assertions) {
+        eprintln!("warning: this is a development build; its times mean nothing (cargo build --release)");
+    }
+    let simd = kernels::self_check()?;
+    let config = args.model.extract_config()?;
+    let path = args.model.weights_for(&config)?;
+    let weights = VitWeights::load(&path, config.preset, config.heads)?;
+    let extractor = Arc::new(Extractor::from_weights(&config, &weights, &config.head)?);
+    let (folder, _temporary) = folder(args.data.as_deref())?;
+    let limits = Limits::measure(simd);
+    let mut report = Report {
+        version: env!("CARGO_PKG_VERSION"),
+        simd: simd.level().to_string(),
+        threads: rayon::current_num_threads(),
+        encoder: extractor.encoder_name(),
+        limits,
+        rows: Vec::new(),
+        end_to_end: Vec::new(),
+    };
+    println!("{}", table::machine(&report));
+    if args.end_to_end {
+        let plan = EndToEnd {
+            references: &args.references,
+            drawn: args.drawn,
+            clients: &args.clients,
+            seconds: args.seconds,
+            extractor,
+            folder: &folder,
+            peers: args.peers.as_deref().map(|python| (python, path.as_path())),
+        };
+        report.end_to_end = plan.measure()?;
+        println!("{}", table::end_to_end(&report.end_to_end));
+    } else {
+        let spec = config.encoder_spec()?;
+        let bench = Bench { extractor, weights, spec, limits, folder, rounds: args.rounds as usize };
+        report.rows = rows(&bench, &args.only)?;
+        println!("{}", table::rows(&report.rows));
+    }
+    if let Some(path) = &args.json {
+        std::fs::write(path, serde_json::to_vec_pretty(&report)?)
+            .with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    Ok(())
+}
+
+fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<Row>> {
+    for name in only {
+        ensure!(NAMES.contains(&name.as_str()), "there is no row {name:?}; there are {}", NAMES.join(", "));
+    }
+    let wanted = |name: &&str| only.iter().any(|wanted| wanted == name) || only.is_empty() && *name != "search_10m";
+    let names: Vec<&str> = NAMES.into_iter().filter(wanted).collect();
+    let bar = ProgressBar::new(names.len() as u64)
+        .with_style(ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} {elapsed}")?);
+    bar.enable_steady_tick(Duration::from_millis(500));
+    let mut rows = Vec::new();
+    for name in names {
+        bar.set_message(name.to_owned());
+        match bench.row(name) {
+            Ok(row) => rows.push(row),
+            // Named rows must be measured; of all rows, those this CPU can.
+            Err(BenchError::Extract(error @ ExtractError::Precision { .. })) if only.is_empty() => {
+                bar.println(format!("left out {name}: {error}"));
+            }
+            Err(error) => return Err(error.into()),
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok(rows)
+}
+
+/// The folder given, or one that is removed with the second value.
+fn folder(given: Option<&Path>) -> anyhow::Result<(PathBuf, Option<TemporaryFolder>)> {
+    if let Some(path) = given {
+        std::fs::create_dir_all(path).with_context(|| format!("cannot make {}", path.display()))?;
+        return Ok((path.to_owned(), None));
+    }
+    let path = std::env::temp_dir().join(format!("placeformer-bench-{}", std::process::id()));
+    std::fs::create_dir(&path).with_context(|| format!("cannot make {}", path.display()))?;
+    Ok((path.clone(), Some(TemporaryFolder(path))))
+}
+
+struct TemporaryFolder(PathBuf);
+
+impl Drop for TemporaryFolder {
+    fn drop(&mut self) {
+        if let Err(error) = std::fs::remove_dir_all(&self.0) {
+            eprintln!("warning: {} is left behind: {error}", self.0.display());
+        }
+    }
+}

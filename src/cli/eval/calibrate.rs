@@ -1,0 +1,119 @@
+//! Fit how far best answers can be trusted.
+
+use super::{CacheArgs, DataArgs, Described, RerankArgs, write};
+use crate::cli::client::{ServerArgs, ServerClient};
+use crate::cli::model_args::ModelOptions;
+use crate::eval::calibrate::{BestAnswers, LeaveOut, OwnPlaces, Purpose, calibrate};
+use crate::eval::datasets::Dataset;
+use crate::eval::features::GlobalKind;
+use crate::eval::run::search_all;
+use crate::types::{Calibration, MapName};
+use anyhow::{Context, ensure};
+use std::path::PathBuf;
+
+/// Arguments of this subcommand.
+#[derive(Debug, clap::Args)]
+pub(super) struct CalibrateArgs {
+    #[command(flatten)]
+    data: DataArgs,
+    #[command(flatten)]
+    model: ModelOptions,
+    #[command(flatten)]
+    rerank: RerankArgs,
+    #[command(flatten)]
+    fit: FitArgs,
+    #[command(flatten)]
+    output: OutputArgs,
+    #[command(flatten)]
+    server: ServerArgs,
+}
+
+/// What is fitted.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Calibration")]
+struct FitArgs {
+    /// Share of right answers among those that are trusted.
+    #[arg(long, default_value_t = 0.99, value_name = "SHARE", value_parser = parse_share)]
+    target_precision: f64,
+    /// When each query's own place is left out of the database to make it unknown.
+    #[arg(long, value_enum, default_value = "auto", value_name = "WHEN")]
+    leave_out: LeaveOut,
+    /// Seed of the cross-validation.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+}
+
+/// Where it goes.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Output")]
+struct OutputArgs {
+    /// Write the calibration as JSON.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Store the calibration with this map of the server.
+    #[arg(long, value_name = "NAME")]
+    map: Option<MapName>,
+    /// What to call the data in the calibration [default: the data set's own name].
+    #[arg(long, value_name = "NAME")]
+    data_name: Option<String>,
+    #[command(flatten)]
+    cache: CacheArgs,
+}
+
+fn parse_share(text: &str) -> Result<f64, String> {
+    let share: f64 = text.parse().map_err(|_| "it is not a number".to_owned())?;
+    if share > 0.0 && share <= 1.0 { Ok(share) } else { Err("use a share above 0 and up to 1, such as 0.99".into()) }
+}
+
+/// Runs it.
+pub(super) fn run(args: CalibrateArgs) -> anyhow::Result<()> {
+    args.rerank.check()?;
+    let dataset = args.data.load()?;
+    let extract = args.model.extract_config()?;
+    let described = Described::new(&args.model, &extract, &args.output.cache, &dataset, GlobalKind::Head)?;
+    let answers = best_answers(&args, &dataset, &described)?;
+    let fitted = calibrate(
+        &answers,
+        Purpose {
+            model: described.extractor.model_id().clone(),
+            rerank: args.rerank.config().id(),
+            data: args.output.data_name.unwrap_or(dataset.name),
+            target_precision: args.fit.target_precision,
+            seed: args.fit.seed,
+        },
+    )?;
+    print!("{}", fitted.text());
+    if let Some(path) = &args.output.out {
+        write(path, &(serde_json::to_string_pretty(&fitted.calibration)? + "\n"))?;
+    }
+    if let Some(map) = &args.output.map {
+        store(args.server, map, &fitted.calibration)?;
+    }
+    Ok(())
+}
+
+fn best_answers(args: &CalibrateArgs, dataset: &Dataset, described: &Described) -> anyhow::Result<BestAnswers> {
+    let (candidates, config) = (args.rerank.candidates, args.rerank.config());
+    let own = OwnPlaces::of(dataset, args.fit.leave_out, args.data.radius);
+    let wanted = |query| own.as_ref().map_or(candidates, |own| own.widened(query, candidates));
+    let (mut answers, _) = search_all(&described.database, &described.queries, wanted);
+    if let Some(own) = &own {
+        eprintln!("each query is also asked with its own place left out of the database");
+        answers.iter_mut().for_each(|answer| own.trim(answer, candidates));
+    }
+    let (answers, _) = described.rerank(answers, &config)?;
+    Ok(match &own {
+        Some(own) => BestAnswers::with_left_out(dataset, own, &answers, candidates),
+        None => BestAnswers::of(dataset, &answers),
+    })
+}
+
+fn store(server: ServerArgs, map: &MapName, calibration: &Calibration) -> anyhow::Result<()> {
+    let address = server.server.clone();
+    let client = ServerClient::new(server)?;
+    let stored = client.put_json(&format!("/maps/{map}/calibration"), calibration);
+    let stored = stored.with_context(|| format!("cannot store the calibration with map {map}"))?;
+    ensure!(stored["model"] == calibration.model().as_str(), "the server stored something else: {stored}");
+    eprintln!("stored with map {map} at {address}");
+    Ok(())
+}

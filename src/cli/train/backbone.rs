@@ -1,0 +1,65 @@
+//! Training blocks of the backbone together with the head, on images.
+
+use super::head::{Source, fit};
+use super::{RunArgs, bar, facts, finish, notes, show};
+use crate::extract::{Aggregate, ExtractConfig, Extractor, Head, HeadChoice, VitWeights};
+use crate::image::ImageConfig;
+use crate::train::{Augmentation, BackboneModel, Session, TrainError, TrainableBlocks, TripletSet};
+use anyhow::ensure;
+
+pub(super) fn train(args: &RunArgs, blocks: TrainableBlocks, augmentation: Augmentation) -> anyhow::Result<()> {
+    crate::kernels::self_check()?;
+    let config = args.config(augmentation)?;
+    let sides = args.data.load(args.method.seed)?;
+    eprintln!("{}", sides.description);
+    let extract = args.model.extract_config()?;
+    let start = starting_head(args, &extract, &sides.training)?;
+    ensure!(
+        *start.aggregate() == Aggregate::Mean,
+        "blocks are trained under the mean of the tokens, and this head takes {}",
+        start.aggregate()
+    );
+    let weights = VitWeights::load(&args.model.weights_for(&extract)?, extract.preset, extract.heads)?;
+    let (spec, images) = (extract.encoder_spec()?, ImageConfig::default());
+    let model = BackboneModel::new(weights, spec, start.weights(), blocks, images, augmentation)?;
+    let identity = format!(
+        "{blocks:?} {} {} {} {} {}",
+        start.backbone(),
+        spec.input_size,
+        start.content_hash(),
+        sides.training.fingerprint(),
+        sides.validation.fingerprint()
+    );
+    let bar = bar(&config)?;
+    let mut progress = |record: &_| show(&bar, record);
+    let session = Session { folder: args.out.clone(), identity, progress: &mut progress };
+    let outcome = model.train(&sides.training, &sides.validation, &config, session)?;
+    bar.finish_and_clear();
+    let (path, head) = (args.out.join("weights.safetensors"), args.out.join("head.safetensors"));
+    let backbone = || -> Result<String, TrainError> {
+        let config = ExtractConfig { head: HeadChoice::None, ..extract.clone() };
+        Ok(Extractor::load(&config, &path, None)?.backbone().to_owned())
+    };
+    let notes = notes(args, &spec.input_size.to_string(), &sides.description, &outcome);
+    model.save(&path, &head, backbone, notes)?;
+    let trained = match blocks {
+        TrainableBlocks::Last(count) => format!("the last {count} computed blocks and the head"),
+        TrainableBlocks::All => "all computed blocks and the head".to_owned(),
+    };
+    let began = format!("{} with head {}", start.backbone(), extract.head);
+    finish(&args.out, &facts(args, &trained, &sides.description, &began), &config, &outcome)?;
+    println!("{}", path.display());
+    Ok(())
+}
+
+/// The head given, or a PCA of the training images. The encoder that finds it is gone before training needs the room.
+fn starting_head(args: &RunArgs, extract: &ExtractConfig, training: &TripletSet) -> anyhow::Result<Head> {
+    let extractor = args.model.open(extract)?;
+    match extractor.head() {
+        Some(head) => Ok(head.clone()),
+        None => {
+            let tokens = Source::open(args, &extractor)?.tokens(training)?;
+            fit(&extractor, &tokens)
+        }
+    }
+}

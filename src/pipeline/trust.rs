@@ -1,0 +1,160 @@
+//! Whether a best answer is to be trusted: by the map's own calibration, else by the model's, else nobody says.
+
+use super::PipelineError;
+use super::query::QueryResult;
+use crate::types::{Calibration, ConfidenceCurve, MapName, ModelId, RerankId};
+
+/// Calibrations that ship, one per model.
+const BUILT_IN: [&str; 1] = [include_str!("../../models/dinov2-vits14-b8.calibration.json")];
+
+/// The calibration built in for `model`, if there is one.
+pub fn built_in_calibration(model: &ModelId) -> Option<Calibration> {
+    // A test reads every one of them, so none is left out here.
+    let mut known = BUILT_IN.iter().filter_map(|text| serde_json::from_str::<Calibration>(text).ok());
+    known.find(|calibration| calibration.model() == model)
+}
+
+/// What can be said about the best answer.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Verdict {
+    /// Whether the best answer is trusted; `None` where no calibration holds.
+    pub matched: Option<bool>,
+    /// Probability, 0 to 1, that the best answer is right; `None` where no calibration holds.
+    pub confidence: Option<f64>,
+}
+
+/// What this server can say about answers in general.
+pub(super) struct Trust {
+    built_in: Option<Calibration>,
+    rerank: RerankId,
+}
+
+impl Trust {
+    /// For a server that runs `model` and re-ranks as `rerank` says.
+    pub(super) fn new(model: &ModelId, rerank: RerankId) -> Self {
+        Self { built_in: built_in_calibration(model), rerank }
+    }
+
+    /// The model's own calibration.
+    pub(super) fn built_in(&self) -> Option<&Calibration> {
+        self.built_in.as_ref()
+    }
+
+    /// Judges the best answer. Where there is none, certainly none is right.
+    pub(super) fn judge(&self, own: Option<&Calibration>, best: Option<&QueryResult>) -> Verdict {
+        let Some(best) = best else { return Verdict { matched: Some(false), confidence: Some(0.0) } };
+        let spatial_score = best.score.as_ref().map(|score| f64::from(score.spatial_score));
+        let Some(curve) = self.curve(own, spatial_score.is_some()) else { return Verdict::default() };
+        let confidence = curve.weights.confidence(spatial_score, f64::from(best.global_distance));
+        Verdict { matched: Some(curve.trusts(confidence)), confidence: Some(confidence) }
+    }
+
+    /// The curve in force. Scores of another re-ranking mean something else; distances do not depend on it.
+    fn curve<'a>(&'a self, own: Option<&'a Calibration>, reranked: bool) -> Option<&'a ConfidenceCurve> {
+        let known = own.into_iter().chain(&self.built_in);
+        let mut holding = known.filter(|calibration| !reranked || *calibration.rerank() == self.rerank);
+        holding.next().map(|calibration| calibration.curve(reranked))
+    }
+
+    /// Refuses a calibration whose S is not this server's.
+    pub(super) fn check(&self, map: &MapName, calibration: &Calibration) -> Result<(), PipelineError> {
+        if *calibration.rerank() == self.rerank {
+            return Ok(());
+        }
+        Err(PipelineError::RerankMismatch {
+            map: map.clone(),
+            server: self.rerank.clone(),
+            given: calibration.rerank().clone(),
+        })
+    }
+
+    /// Says in the log if a map's calibration does not hold for re-ranked answers here.
+    pub(super) fn warn_if_useless(&self, map: &MapName, calibration: Option<&Calibration>) {
+        if let Some(Err(error)) = calibration.map(|calibration| self.check(map, calibration)) {
+            tracing::warn!(%map, %error, "the map's calibration is not used for re-ranked answers");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::extract::Head;
+    use crate::rerank::{PairScore, RerankConfig};
+    use crate::types::{ConfidenceWeights, ContentHash, Reference, ReferenceFields, ReferenceId};
+    use time::OffsetDateTime;
+
+    fn curve(bias: f64, score: f64) -> ConfidenceCurve {
+        let weights = ConfidenceWeights { bias, score, distance: -1.0 };
+        let (right, wrong, without_match) = (9, 5, 4);
+        let (precision, recall, expected_calibration_error) = (1.0, 0.9, 0.01);
+        let threshold = 0.8;
+        ConfidenceCurve {
+            weights,
+            threshold,
+            right,
+            wrong,
+            without_match,
+            precision,
+            recall,
+            expected_calibration_error,
+        }
+    }
+
+    fn calibration(rerank: &str, bias: f64) -> Calibration {
+        let curves = [curve(bias, 1.0), curve(bias, 0.0)];
+        Calibration::new(ModelId::new("m"), RerankId::new(rerank), "test", 0.99, curves).unwrap()
+    }
+
+    fn result(spatial_score: Option<u32>, global_distance: f32) -> QueryResult {
+        let reference = Reference {
+            id: ReferenceId::generate(),
+            map: "m".parse().unwrap(),
+            fields: ReferenceFields::default(),
+            content_hash: ContentHash([0; 32]),
+            model: ModelId::new("m"),
+            created_at: OffsetDateTime::UNIX_EPOCH,
+        };
+        let score = spatial_score.map(|spatial_score| PairScore { spatial_score, combinations: Vec::new() });
+        QueryResult { reference, global_distance, score }
+    }
+
+    #[test]
+    fn what_ships_can_be_read_and_holds_for_the_default_re_ranking() {
+        for text in BUILT_IN {
+            let shipped: Calibration = serde_json::from_str(text).unwrap();
+            assert_eq!(built_in_calibration(shipped.model()), Some(shipped.clone()));
+            assert_eq!(*shipped.rerank(), RerankConfig::default().id());
+            // Whoever makes another head must fit another calibration, or the default model goes without.
+            let parts: Vec<&str> = shipped.model().as_str().split(':').collect();
+            let head = Head::built_in(&parts[..3].join(":")).unwrap().expect("a head ships for this backbone");
+            assert_eq!(*parts.last().unwrap(), format!("h{}", &head.content_hash()[..12]), "see `make calibration`");
+        }
+        assert_eq!(built_in_calibration(&ModelId::new("another")), None);
+    }
+
+    #[test]
+    fn the_maps_own_calibration_comes_first_and_only_where_it_holds() {
+        let trust = Trust { built_in: Some(calibration("r", -3.0)), rerank: RerankId::new("r") };
+        let (sure, unsure) = (result(Some(1000), 0.2), result(Some(3), 1.2));
+        let of_model = trust.judge(None, Some(&sure));
+        assert_eq!(of_model.matched, Some(true));
+        assert_eq!(trust.judge(None, Some(&unsure)).matched, Some(false));
+        let own = trust.judge(Some(&calibration("r", -9.0)), Some(&sure));
+        assert!(own.confidence < of_model.confidence && own.matched == Some(false), "{own:?}");
+        // Fitted for another re-ranking: its distances still hold, its scores do not.
+        let foreign = calibration("other", -9.0);
+        assert_eq!(trust.judge(Some(&foreign), Some(&sure)), of_model);
+        let global = trust.judge(Some(&foreign), Some(&result(None, 0.2)));
+        assert!((global.confidence.unwrap() - 1.0 / (1.0 + 9.2f64.exp())).abs() < 1e-6, "{global:?}");
+    }
+
+    #[test]
+    fn without_a_calibration_nothing_is_guessed_but_nothing_is_no_match() {
+        let trust = Trust { built_in: None, rerank: RerankId::new("r") };
+        assert_eq!(trust.judge(None, Some(&result(Some(1000), 0.1))), Verdict::default());
+        assert_eq!(trust.judge(None, None), Verdict { matched: Some(false), confidence: Some(0.0) });
+        let refused = trust.check(&"m".parse().unwrap(), &calibration("other", 0.0)).unwrap_err().to_string();
+        assert!(refused.contains("\"r\"") && refused.contains("\"other\""), "{refused}");
+    }
+}

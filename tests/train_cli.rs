@@ -1,0 +1,166 @@
+//! `train`, `head train`, `head fit` and `map rehead` from flags to files, on a small drawn town.
+
+use placeformer::extract::pull::model_path;
+use placeformer::extract::{Aggregate, Head, Preset, VitWeights};
+use placeformer::store::{PlaceStore, SqliteStore, StoreConfig};
+use std::path::Path;
+use std::process::{Command, Output};
+
+/// Small images: what is tested is the way from flags to files, not recall.
+const SIZE: &str = "84x84";
+/// The same, as a setting.
+const SERVED_SIZE: &str = "{width=84,height=84}";
+
+/// Whether the model is there; a run without it must say so.
+fn has_model() -> bool {
+    let path = model_path(Preset::Dinov2Vits14).unwrap();
+    if !path.exists() && std::env::var("PLACEFORMER_TEST_NO_MODEL").is_ok_and(|value| value == "1") {
+        println!("skipped: no model at {} and PLACEFORMER_TEST_NO_MODEL=1", path.display());
+        return false;
+    }
+    assert!(path.exists(), "no model at {}: run `placeformer model pull dinov2-vits14` first", path.display());
+    true
+}
+
+fn placeformer(folder: &Path, arguments: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
+    command.args(arguments).current_dir(folder).env_remove("PLACEFORMER_WEIGHTS").env_remove("PLACEFORMER_CONFIG");
+    command.env("PLACEFORMER_EXTRACT__INPUT_SIZE", SERVED_SIZE).output().expect("the binary was built")
+}
+
+fn succeeds(folder: &Path, arguments: &[&str]) -> String {
+    let output = placeformer(folder, arguments);
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments:?}: {error}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn refusal(folder: &Path, arguments: &[&str]) -> String {
+    let output = placeformer(folder, arguments);
+    assert!(!output.status.success(), "{arguments:?} succeeded");
+    String::from_utf8(output.stderr).unwrap()
+}
+
+/// Eight places along a street of 360 m, some references and a query each, and a query from elsewhere.
+fn town(views: &str) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    succeeds(folder.path(), &["synth", "--out", "town", "--places", "8", "--views", views, "--size", "96x72"]);
+    folder
+}
+
+fn train(more: &[&'static str]) -> Vec<&'static str> {
+    let data = ["--dataset", "csv", "--root", "town", "--input-size", SIZE];
+    let run = ["--cache", "cache", "--steps", "20", "--mine-every", "5", "--batch", "4"];
+    [&["train"], &data[..], &run, more].concat()
+}
+
+#[test]
+fn a_head_is_trained_continued_and_given_to_a_map() {
+    if !has_model() {
+        return;
+    }
+    let folder = town("2");
+    let folder = folder.path();
+    // The margin is wide so that every triplet teaches something.
+    let command = train(&["--out", "run", "--learning-rate", "0.01", "--margin", "0.5", "--validation-share", "0.3"]);
+    let first = succeeds(folder, &command);
+    assert!(first.contains("R@1") && first.contains("run/head.safetensors"), "{first}");
+    let log = std::fs::read_to_string(folder.join("run/train.jsonl")).unwrap();
+    assert_eq!(log.lines().count(), 4, "{log}");
+    let page = std::fs::read_to_string(folder.join("run/report.html")).unwrap();
+    assert!(page.contains("Training loss") && page.contains("town"));
+    // The same command finds the run finished; other data under the same folder is refused.
+    let head = || Head::load(&folder.join("run/head.safetensors")).unwrap();
+    let before = head();
+    assert_eq!((succeeds(folder, &command), head()), (first, before));
+    let other = train(&["--out", "run", "--learning-rate", "0.01", "--margin", "0.5", "--validation-share", "0.6"]);
+    assert!(refusal(folder, &other).contains("other data"));
+    give_to_a_map(folder);
+}
+
+/// Imports with the built-in head, then exchanges it for the trained one: the map is what a server with that head has.
+fn give_to_a_map(folder: &Path) {
+    // Validation may not have improved, in which case the head kept is the first; this one differs for certain.
+    let trained = Head::load(&folder.join("run/head.safetensors")).unwrap();
+    let (weight, bias) = trained.weights();
+    let scaled: Vec<f32> = weight.iter().enumerate().map(|(i, w)| if i % 2 == 0 { w * 1.5 } else { *w }).collect();
+    let new = trained.with_weights(scaled.clone(), bias.to_vec(), trained.notes().clone()).unwrap();
+    new.save(&folder.join("new.safetensors")).unwrap();
+    let import = ["import", "town/database", "--map", "town", "--data", "store"];
+    succeeds(folder, &import);
+    let model = |name: &str| {
+        let store = SqliteStore::open(&folder.join("store"), &StoreConfig::default()).unwrap();
+        let mut globals = Vec::new();
+        store.scan_globals(&name.parse().unwrap(), &mut |row| globals.push(row.global)).unwrap();
+        (store.map(&name.parse().unwrap()).unwrap().model, globals)
+    };
+    let (before, old) = model("town");
+    let gem = Head::new(Aggregate::gem(3.0).unwrap(), scaled, bias.to_vec(), new.backbone(), [].into()).unwrap();
+    gem.save(&folder.join("gem.safetensors")).unwrap();
+    let rehead = |head| ["map", "rehead", "town", "--head", head, "--data", "store"];
+    let refused = refusal(folder, &rehead("gem.safetensors"));
+    assert!(refused.contains("made by mean") && refused.contains("those of gem3"), "{refused}");
+    assert_eq!(model("town"), (before.clone(), old.clone()), "a refused head changes nothing");
+    assert!(succeeds(folder, &rehead("new.safetensors")).contains("16 references"));
+    let (after, projected) = model("town");
+    assert_eq!(after, new.rebind(&before).unwrap());
+    assert!(succeeds(folder, &rehead("new.safetensors")).contains("already"));
+    // What extraction with the new head gives, but for the half precision of what the store kept.
+    let mut fresh = Command::new(env!("CARGO_BIN_EXE_placeformer"));
+    fresh.args(["import", "town/database", "--map", "fresh", "--data", "store"]).current_dir(folder);
+    fresh.env("PLACEFORMER_EXTRACT__INPUT_SIZE", SERVED_SIZE).env("PLACEFORMER_EXTRACT__HEAD", "new.safetensors");
+    assert!(fresh.env_remove("PLACEFORMER_CONFIG").output().unwrap().status.success());
+    let (model_of_fresh, expected) = model("fresh");
+    assert_eq!(model_of_fresh, after);
+    // Four photos are imported at once, so the two maps differ in order.
+    let nearest = |global: &Vec<f32>, others: &[Vec<f32>]| {
+        let distance = |other: &Vec<f32>| global.iter().zip(other).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
+        others.iter().map(distance).fold(f32::INFINITY, f32::min)
+    };
+    assert!(projected.iter().all(|global| nearest(global, &expected) < 1e-4));
+    assert!(old.iter().all(|global| nearest(global, &expected) > 1e-4), "the new head is another");
+}
+
+#[test]
+fn the_last_block_is_trained_on_varied_images_of_drives() {
+    if !has_model() {
+        return;
+    }
+    let folder = town("1");
+    let text = "train --trainable last-1 --drives town/database town/queries --positive-frames 1 --negative-frames 2 \
+                --validation-share 0.4 --steps 1 --mine-every 1 --warm-up 0 --batch 2 --out blocks --input-size";
+    let mut arguments: Vec<&str> = text.split_whitespace().collect();
+    arguments.push(SIZE);
+    let said = succeeds(folder.path(), &arguments);
+    let (weights, head) =
+        (folder.path().join("blocks/weights.safetensors"), folder.path().join("blocks/head.safetensors"));
+    assert!(said.contains("blocks/weights.safetensors") && weights.exists(), "{said}");
+    // Bound to the weights beside it, whichever were kept.
+    let weights = VitWeights::load(&weights, Preset::Dinov2Vits14, None).unwrap();
+    let bound = format!("dinov2-vits14:{}:b8", &weights.content_hash()[..12]);
+    assert_eq!(Head::load(&head).unwrap().backbone(), bound);
+}
+
+#[test]
+fn what_cannot_be_trained_is_refused_before_the_model_is_loaded() {
+    let folder = town("1");
+    let folder = folder.path();
+    std::fs::create_dir(folder.join("empty")).unwrap();
+    for (arguments, part) in [
+        (&["train", "--out", "x"][..], "--dataset"),
+        (&["train", "--out", "x", "--dataset", "csv"], "--root"),
+        (&["train", "--out", "x", "--drives", "town/database", "--trainable", "last-0"], "last-N"),
+        (&["train", "--out", "x", "--drives", "town/database", "--viewpoint", "0.1"], "cached tokens"),
+        (&["train", "--out", "x", "--drives", "town/database", "--warm-up", "9000"], "warm-up"),
+        (&["train", "--out", "x", "--drives", "empty"], "holds no JPEG"),
+        (&["train", "--out", "x", "--drives", "town/database", "--validation-share", "2"], "between 0 and 1"),
+        (&["train", "--out", "x", "--drives", "town/database"], "nothing to learn from"),
+        (&["head", "train", "--out", "x", "--dataset", "csv", "--root", "town", "--positive-m", "30"], "no order"),
+        (&["head", "fit", "--images", "empty", "--out", "x"], "no images"),
+        (&["head", "fit", "--images", "town", "--out", "x", "--aggregate", "gem", "--gem-p", "0.5"], "from 1 to 64"),
+        (&["map", "rehead", "town", "--head", "absent", "--data", "town"], "absent"),
+    ] {
+        let error = refusal(folder, arguments);
+        assert!(error.contains(part), "{arguments:?}: {error}");
+    }
+}
