@@ -20,7 +20,7 @@
 //! | [`config`], [`ops`] | settings; metrics, logs, health, shutdown |
 //! | [`eval`], [`train`] | recall on data sets; learning the head and the backbone |
 //! | [`synth`], [`draw`] | the street renderer behind the demo map; pictures of matches |
-//! | [`bench`] | every stage beside a plain implementation and the machine's limit |
+//! | [`mod@bench`] | every stage beside a plain implementation and the machine's limit |
 //! | [`cli`] | one file per subcommand |
 //!
 //! Imports point one way, `http -> pipeline -> stages -> {types, error, kernels}`;

@@ -1,6 +1,6 @@
 //! The web surface over the pipeline.
 //!
-//! [`app`] turns an [`AppState`] into a router that tests call without a socket; [`serve`] runs it on a listener
+//! [`app`] turns an [`AppState`] into a router that tests call without a socket; [`serve()`] runs it on a listener
 //! with the limits that only a connection knows. From the outside in, a request passes: its id, span and metrics
 //! ([`observe`]); a net for panics; key and rate ([`auth`], [`limits`]); the body within its bounds ([`body`]); the
 //! handler ([`routes`]). Every failure leaves as problem+json ([`problem`]).
