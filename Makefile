@@ -5,7 +5,7 @@ SHELL := bash
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
 # What `make test` and CI run, cheapest first.
-TEST_STEPS := fmt promtool deny clippy unit doc schemathesis compose
+TEST_STEPS := fmt promtool deny clippy unit simd doc schemathesis compose
 PYTHON ?= python3
 FUZZ_SECONDS ?= 60
 MODEL ?= dinov2-vits14
@@ -75,6 +75,10 @@ advisories: .venv/tools ## Known vulnerabilities (needs the network)
 unit: .venv/tools model ## Unit, property and behaviour tests
 	cargo nextest run --locked --no-fail-fast
 
+.PHONY: simd
+simd: model ## The comparisons with stored outputs, at every level of SIMD
+	BIN=$(DEBUG_BIN) tests/simd_levels.sh
+
 .PHONY: doc
 doc: ## Examples in the documentation, and its links
 	cargo test --locked --doc
@@ -100,6 +104,21 @@ compose: model ## The composed system end to end (skips without Docker)
 .PHONY: fuzz
 fuzz: .venv/tools ## Each fuzz target for FUZZ_SECONDS (60)
 	fuzz/run.sh $(FUZZ_SECONDS)
+
+# Valgrind knows no AVX-512, so under it the kernels' tests stop at AVX2; the sanitizer covers every level. The stable
+# compiler carries the sanitizer but needs to be told that it may be used.
+.PHONY: valgrind
+valgrind: ## The kernels' tests under valgrind (needs it installed)
+	cargo test --locked --lib --no-run
+	PROPTEST_CASES=4 valgrind --quiet --error-exitcode=1 \
+	  $$(cargo test --locked --lib --no-run --message-format json | \
+	     $(PYTHON) -c 'import json,sys; print([m["executable"] for m in map(json.loads, sys.stdin) if m.get("executable")][-1])') \
+	  kernels:: --test-threads 1
+
+.PHONY: asan
+asan: ## The kernels' tests under AddressSanitizer
+	RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address cargo test --locked --lib --target-dir target/asan \
+	  --target x86_64-unknown-linux-gnu kernels::
 
 .PHONY: clean
 clean: ## Remove everything made here

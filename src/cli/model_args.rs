@@ -42,7 +42,7 @@ pub struct ModelOptions {
     /// Distance between fused windows: kernel or one.
     #[arg(long, value_parser = parse_stride)]
     pub stride: Option<PoolingStride>,
-    /// Arithmetic of the transformer: auto (f32), f32, bf16 or int8 (linear layers; attention is bf16).
+    /// Arithmetic of the transformer: auto (bf16 where the CPU has it, else f32), f32, bf16 or int8.
     #[arg(long, value_parser = parse_precision)]
     pub precision: Option<Precision>,
 }

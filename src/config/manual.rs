@@ -101,7 +101,10 @@ pub(super) const SECTIONS: &[(&str, Keys)] = &[
             ("caps", "Most key patches at scales 1, 2 and 3."),
             ("stride", "Distance between fused windows: \"kernel\" (no overlap) or \"one\" (every patch)."),
             ("head", "Projection to the global descriptor: \"default\" or a file."),
-            ("precision", "Arithmetic of the linear layers."),
+            (
+                "precision",
+                "Arithmetic of the transformer: auto (bf16 where the CPU has it, else f32), f32, bf16 or int8.",
+            ),
         ],
     ),
     (

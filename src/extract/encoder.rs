@@ -85,12 +85,12 @@ pub trait Encoder: Send + Sync {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// The fastest of which no loss of recall has been measured: f32.
+    /// The fastest of which no loss of recall has been measured: bf16 where the CPU has it, else f32.
     #[default]
     Auto,
     /// 32-bit floats.
     F32,
-    /// bfloat16 products, 32-bit sums.
+    /// bfloat16 products, 32-bit sums and scores.
     Bf16,
     /// 8-bit integer products, 32-bit sums.
     Int8,

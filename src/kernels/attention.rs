@@ -30,8 +30,10 @@ const GROUP_SCORES: usize = 40 * 1024;
 /// How the tokens of an image and their heads are laid out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AttentionShape {
-    /// Format of both products: f32 or bf16.
-    pub format: Format,
+    /// Format of queries and keys: f32 or bf16.
+    pub score_format: Format,
+    /// Format of weights and values: f32 or bf16.
+    pub mix_format: Format,
     /// Tokens of an image, CLS included.
     pub tokens: usize,
     /// Heads.
@@ -48,9 +50,14 @@ impl AttentionShape {
         self.tokens.div_ceil(self.chunk_rows)
     }
 
-    /// Words of one chunk's keys, or of its values: all heads.
-    pub fn chunk_len(&self) -> usize {
-        self.heads * self.head_len()
+    /// Words of one chunk's keys: all heads.
+    pub fn keys_len(&self) -> usize {
+        self.heads * self.head_keys()
+    }
+
+    /// Words of one chunk's values: all heads.
+    pub fn values_len(&self) -> usize {
+        self.heads * self.head_values()
     }
 
     /// Words of one token's queries: all heads.
@@ -59,11 +66,15 @@ impl AttentionShape {
     }
 
     fn head_words(&self) -> usize {
-        self.format.words(self.head_dim)
+        self.score_format.words(self.head_dim)
     }
 
-    fn head_len(&self) -> usize {
+    fn head_keys(&self) -> usize {
         self.head_words() * self.chunk_rows
+    }
+
+    fn head_values(&self) -> usize {
+        self.mix_format.words(self.chunk_rows) * self.head_dim
     }
 
     fn padded_tokens(&self) -> usize {
@@ -87,7 +98,7 @@ impl AttentionShape {
 /// # Panics
 /// If `queries` is too short.
 pub fn store_queries(shape: &AttentionShape, head: usize, dim: usize, block: Rows<'_>, queries: &mut [u32]) {
-    let at = head * shape.head_words() + shape.format.words(dim);
+    let at = head * shape.head_words() + shape.score_format.words(dim);
     for (row, words) in block.data.chunks_exact(block.stride).enumerate() {
         queries[row * shape.query_len() + at..][..words.len()].copy_from_slice(words);
     }
@@ -99,12 +110,12 @@ pub fn store_queries(shape: &AttentionShape, head: usize, dim: usize, block: Row
 /// If `keys` is not a chunk of `shape`.
 pub fn store_keys(simd: Simd, shape: &AttentionShape, head: usize, dim: usize, block: Rows<'_>, keys: &mut [u32]) {
     let (columns, panel_len) = (Tiling::of(simd).columns, shape.head_words() * Tiling::of(simd).columns);
-    assert_eq!(keys.len(), shape.chunk_len(), "not one chunk of keys");
-    let head = &mut keys[head * shape.head_len()..][..shape.head_len()];
+    assert_eq!(keys.len(), shape.keys_len(), "not one chunk of keys");
+    let head = &mut keys[head * shape.head_keys()..][..shape.head_keys()];
     for (token, row) in block.data.chunks_exact(block.stride).enumerate() {
         let panel = &mut head[token / columns * panel_len..][..panel_len];
         for (offset, &word) in row.iter().enumerate() {
-            panel[(shape.format.words(dim) + offset) * columns + token % columns] = word;
+            panel[(shape.score_format.words(dim) + offset) * columns + token % columns] = word;
         }
     }
 }
@@ -115,10 +126,10 @@ pub fn store_keys(simd: Simd, shape: &AttentionShape, head: usize, dim: usize, b
 /// If `values` is not a chunk of `shape`.
 pub fn store_values(simd: Simd, shape: &AttentionShape, head: usize, dim: usize, block: Rows<'_>, values: &mut [u32]) {
     let columns = Tiling::of(simd).columns;
-    assert_eq!(values.len(), shape.chunk_len(), "not one chunk of values");
-    let panel = head * shape.head_len() + dim / columns * shape.format.words(shape.chunk_rows) * columns;
+    assert_eq!(values.len(), shape.values_len(), "not one chunk of values");
+    let panel = head * shape.head_values() + dim / columns * shape.mix_format.words(shape.chunk_rows) * columns;
     let panel = &mut values[panel..];
-    if shape.format == Format::F32 {
+    if shape.mix_format == Format::F32 {
         return panel[..block.data.len()].copy_from_slice(block.data);
     }
     for (pair, out) in block.data.chunks_exact(2 * block.stride).zip(panel.chunks_exact_mut(columns)) {
@@ -144,10 +155,10 @@ fn score(
     let columns = Tiling::of(simd).columns;
     let (panel_len, per_chunk) = (shape.head_words() * columns, shape.chunk_rows / columns);
     for panel in 0..shape.tokens.div_ceil(columns) {
-        let at = panel / per_chunk * shape.chunk_len() + head * shape.head_len() + panel % per_chunk * panel_len;
+        let at = panel / per_chunk * shape.keys_len() + head * shape.head_keys() + panel % per_chunk * panel_len;
         let right = Panel::whole(&keys[at..at + panel_len], shape.head_words());
         let out = &mut out[panel * columns..];
-        multiply_panel(simd, shape.format, rows, queries, right, out, shape.padded_tokens());
+        multiply_panel(simd, shape.score_format, rows, queries, right, out, shape.padded_tokens());
     }
 }
 
@@ -179,19 +190,19 @@ pub fn attend(
         let count = group.min(rows - first);
         score(simd, shape, head, head_queries(shape, head, first, queries), count, keys, scratch);
         for (row, reciprocal) in scratch.chunks_exact_mut(width).zip(&mut reciprocals[..count]) {
-            *reciprocal = exponentiate_row(simd, shape.format, &mut row[..shape.tokens]);
+            *reciprocal = exponentiate_row(simd, shape.mix_format, &mut row[..shape.tokens]);
         }
         let out = &mut out[first * out_stride..];
         for dim in (0..shape.head_dim).step_by(columns) {
-            let segment_rows = shape.format.words(shape.chunk_rows);
+            let segment_rows = shape.mix_format.words(shape.chunk_rows);
             let panel = Panel {
-                data: &values[head * shape.head_len() + dim * segment_rows..],
-                k: shape.format.words(shape.tokens),
+                data: &values[head * shape.head_values() + dim * segment_rows..],
+                k: shape.mix_format.words(shape.tokens),
                 segment_rows,
-                segment_stride: shape.chunk_len(),
+                segment_stride: shape.values_len(),
             };
             let weights = Rows::f32(scratch, width);
-            multiply_panel(simd, shape.format, count, weights, panel, &mut out[dim..], out_stride);
+            multiply_panel(simd, shape.mix_format, count, weights, panel, &mut out[dim..], out_stride);
         }
         scale_rows(&reciprocals[..count], shape.head_dim, out, out_stride);
     }
@@ -218,12 +229,18 @@ pub fn first_row_attention(
 
 /// Blocked attention against the definition in f64, on a token count that fills no panel.
 pub(super) fn check(simd: Simd) -> Result<(), String> {
-    for format in [Format::F32, Format::Bf16].into_iter().filter(|format| format.is_available(simd)) {
+    for formats in formats(simd) {
         for extra in 1..4 {
-            compare_with_definition(simd, format, chunk_rows(simd) + 10 * extra + 1, 2, 32)?;
+            compare_with_definition(simd, formats, chunk_rows(simd) + 10 * extra + 1, 2, 32)?;
         }
     }
     Ok(())
+}
+
+/// The formats of scores and of the mix that a level can.
+fn formats(simd: Simd) -> impl Iterator<Item = (Format, Format)> {
+    let pairs = [(Format::F32, Format::F32), (Format::F32, Format::Bf16), (Format::Bf16, Format::Bf16)];
+    pairs.into_iter().filter(move |pair| pair.0.is_available(simd) && pair.1.is_available(simd))
 }
 
 /// Queries, keys and values `[tokens, dim]` of one image, laid out as the encoder does.
@@ -232,10 +249,10 @@ fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, 
     let (columns, dim) = (Tiling::of(simd).columns, shape.heads * shape.head_dim);
     let nothing = f32::NAN.to_bits();
     let mut queries = vec![nothing; shape.padded_tokens() * shape.query_len()];
-    let (mut keys, mut values) = (vec![nothing; shape.chunks() * shape.chunk_len()], Vec::new());
-    values.resize(keys.len(), nothing);
+    let mut keys = vec![nothing; shape.chunks() * shape.keys_len()];
+    let mut values = vec![nothing; shape.chunks() * shape.values_len()];
     for chunk in 0..shape.chunks() {
-        let places = chunk * shape.chunk_len()..(chunk + 1) * shape.chunk_len();
+        let of = |len: usize| chunk * len..(chunk + 1) * len;
         // Whole tiles are written, as the encoder does: beyond the last token there are finite numbers.
         let filled = (shape.tokens - chunk * shape.chunk_rows).min(shape.chunk_rows);
         let filled = filled.next_multiple_of(Tiling::of(simd).rows);
@@ -247,16 +264,18 @@ fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, 
             };
             let blocks = rows.map(block);
             let mut buffers = [(); 3].map(|()| OperandBuffer::default());
+            let formats = [shape.score_format, shape.score_format, shape.mix_format];
             let mut words = buffers
                 .iter_mut()
                 .zip(&blocks)
-                .map(|(buffer, block)| buffer.pack(simd, shape.format, filled, columns, (block, columns)).rows);
+                .zip(formats)
+                .map(|((buffer, block), format)| buffer.pack(simd, format, filled, columns, (block, columns)).rows);
             let mut next = || words.next().unwrap_or(Rows { data: &[], stride: 1 });
             let (query, key, value) = (next(), next(), next());
             let first = chunk * shape.chunk_rows * shape.query_len();
             store_queries(shape, head, within, query, &mut queries[first..]);
-            store_keys(simd, shape, head, within, key, &mut keys[places.clone()]);
-            store_values(simd, shape, head, within, value, &mut values[places.clone()]);
+            store_keys(simd, shape, head, within, key, &mut keys[of(shape.keys_len())]);
+            store_values(simd, shape, head, within, value, &mut values[of(shape.values_len())]);
         }
     }
     (queries, keys, values)
@@ -264,18 +283,22 @@ fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, 
 
 fn compare_with_definition(
     simd: Simd,
-    format: Format,
+    (score_format, mix_format): (Format, Format),
     tokens: usize,
     heads: usize,
     head_dim: usize,
 ) -> Result<(), String> {
     use super::testing::{differ, ramp};
-    let shape = AttentionShape { format, tokens, heads, head_dim, chunk_rows: chunk_rows(simd) };
+    let shape = AttentionShape { score_format, mix_format, tokens, heads, head_dim, chunk_rows: chunk_rows(simd) };
     let (dim, padded) = (heads * head_dim, shape.padded_tokens());
     let [query_rows, key_rows, value_rows] = [11, 12, 13].map(|seed| ramp(padded * dim, seed));
     let (queries, keys, values) = lay_out(simd, &shape, [&query_rows, &key_rows, &value_rows]);
     // bf16 keeps eight bits: of the scores, then of the weights.
-    let (of_values, of_weights) = if format == Format::F32 { (1e-5, 1e-5) } else { (2e-2, 5e-3) };
+    let (of_values, of_weights) = match (score_format, mix_format) {
+        (Format::F32, Format::F32) => (1e-5, 1e-5),
+        (Format::F32, _) => (5e-3, 1e-5),
+        _ => (2e-2, 5e-3),
+    };
     let rows = Tiling::of(simd).rows * 3;
     let (mut scratch, mut out) = (vec![f32::NAN; shape.scratch_len(simd)], vec![0.0; rows * dim]);
     let mut first = vec![0.0; tokens];
@@ -295,12 +318,16 @@ fn compare_with_definition(
                 let mix = |token: usize| weights[token] / total * f64::from(value_rows[token * dim + at + i]);
                 let (actual, expected) = (out[row * dim + at + i], (0..tokens).map(mix).sum());
                 if differ(actual, expected, of_values) {
-                    return Err(format!("{format:?}, {tokens} tokens, row {row}: {actual} is not {expected}"));
+                    return Err(format!(
+                        "{score_format:?}, {mix_format:?}, {tokens} tokens, row {row}: {actual} is not {expected}"
+                    ));
                 }
             }
             let off = |t: &usize| row == 0 && differ(first[*t], weights[*t] / total, of_weights);
             if let Some(token) = (0..tokens).find(off) {
-                return Err(format!("{format:?}, {tokens} tokens: weight {token} of the first row is off"));
+                return Err(format!(
+                    "{score_format:?}, {mix_format:?}, {tokens} tokens: weight {token} of the first row is off"
+                ));
             }
         }
     }
@@ -317,8 +344,8 @@ mod tests {
         #[test]
         fn equals_the_definition(tokens in 36usize..180, heads in 1usize..3) {
             for simd in Simd::all() {
-                for format in [Format::F32, Format::Bf16].into_iter().filter(|format| format.is_available(simd)) {
-                    prop_assert_eq!(compare_with_definition(simd, format, tokens, heads, 32), Ok(()));
+                for formats in formats(simd) {
+                    prop_assert_eq!(compare_with_definition(simd, formats, tokens, heads, 32), Ok(()));
                 }
             }
         }

@@ -6,7 +6,7 @@
 //! maximal error.
 
 use super::Simd;
-use super::gemm::{PanelCodes, Tiling};
+use super::gemm::{PanelCodes, Tiling, covers};
 #[cfg(target_arch = "x86_64")]
 use super::lanes::{Avx2, Avx512};
 use super::lanes::{Lanes, Portable, ROUNDING, at_bf16_level, at_level};
@@ -47,9 +47,9 @@ pub fn finish_block(simd: Simd, epilogue: Epilogue, product: Product<'_>, out: &
     if rows == 0 {
         return;
     }
-    assert!(product.block.len() >= rows * columns, "block too short");
+    assert!(covers(product.block.len(), rows, columns, columns), "block too short");
     assert!(product.bias.is_none_or(|bias| bias.len() >= columns), "bias too short");
-    assert!(out.len() >= (rows - 1) * out_stride + columns, "result too short");
+    assert!(covers(out.len(), rows, out_stride, columns), "result too short");
     if let Some(codes) = product.codes {
         assert!(product.factors.len() >= rows, "factors of the rows too short");
         assert!(codes.factors.len() >= columns && codes.offsets.len() >= columns, "factors of the columns too short");

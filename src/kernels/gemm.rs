@@ -185,11 +185,16 @@ impl<'a> Panel<'a> {
         Self { data, k, segment_rows: k.max(1), segment_stride: 0 }
     }
 
-    fn extent(&self, columns: usize) -> usize {
-        match self.k.checked_sub(1) {
-            None => 0,
-            Some(last) => last / self.segment_rows * self.segment_stride + (last % self.segment_rows + 1) * columns,
+    /// Words up to the end of the segment that reaches farthest: the last, as long as segments do not lie across each
+    /// other; `None` if they do, or no memory holds that many.
+    fn extent(&self, columns: usize) -> Option<usize> {
+        let Some(last) = self.k.checked_sub(1) else { return Some(0) };
+        let segment = last.checked_div(self.segment_rows)?;
+        if segment > 0 && self.segment_stride < self.segment_rows.checked_mul(columns)? {
+            return None;
         }
+        let rest = (last % self.segment_rows + 1).checked_mul(columns)?;
+        segment.checked_mul(self.segment_stride)?.checked_add(rest)
     }
 }
 
@@ -212,9 +217,9 @@ pub fn multiply_panel(
     if rows == 0 {
         return;
     }
-    assert!(left.data.len() >= (rows - 1) * left.stride + panel.k, "left-hand side too short");
-    assert!(panel.data.len() >= panel.extent(tile.columns), "panel too short");
-    assert!(out.len() >= (rows - 1) * out_stride + tile.columns, "result too short");
+    assert!(covers(left.data.len(), rows, left.stride, panel.k), "left-hand side too short");
+    assert!(panel.extent(tile.columns).is_some_and(|extent| panel.data.len() >= extent), "panel too short");
+    assert!(covers(out.len(), rows, out_stride, tile.columns), "result too short");
     let job = TileJob {
         rows,
         left: left.data.as_ptr(),
@@ -249,6 +254,12 @@ pub fn multiply_panel(
             job.run::<Avx512Int8, 12, 2>(),
         ),
     }
+}
+
+/// Whether `len` elements hold `rows` (at least one) rows of `width`, each `stride` after the one before.
+pub(super) fn covers(len: usize, rows: usize, stride: usize, width: usize) -> bool {
+    let end = (rows - 1).checked_mul(stride).and_then(|start| start.checked_add(width));
+    end.is_some_and(|end| len >= end)
 }
 
 /// The checked arguments of [`multiply_panel`].
@@ -432,6 +443,17 @@ mod tests {
                 prop_assert_eq!(run(panel), run(Panel::whole(&right, k)));
             }
         }
+    }
+
+    #[test]
+    #[should_panic(expected = "panel too short")]
+    fn segments_across_each_other_are_refused() {
+        let tile = Tiling::of(Simd::SCALAR);
+        let data = vec![0; 10 * tile.columns];
+        let panel = Panel { data: &data, k: 11, segment_rows: 10, segment_stride: 0 };
+        let mut out = vec![0.0; tile.rows * tile.columns];
+        let left = vec![0.0; tile.rows * 11];
+        multiply_panel(Simd::SCALAR, Format::F32, tile.rows, Rows::f32(&left, 11), panel, &mut out, tile.columns);
     }
 
     #[test]

@@ -5,6 +5,7 @@
 
 use super::Simd;
 use super::aligned::AlignedBuffer;
+use super::gemm::covers;
 #[cfg(target_arch = "x86_64")]
 use super::lanes::{Avx2, Avx512};
 use super::lanes::{Lanes, Portable, at_bf16_level, at_level};
@@ -105,7 +106,7 @@ impl OperandBuffer {
             return Left { rows: Rows::f32(source, stride), factors: &[] };
         }
         assert_eq!(width % width_step(simd), 0, "rows must be whole vectors wide");
-        assert!(rows == 0 || source.len() >= (rows - 1) * stride + width, "source too short");
+        assert!(rows == 0 || covers(source.len(), rows, stride, width), "source too short");
         let words = format.words(width);
         self.words.resize(rows * words);
         self.factors.resize(if format == Format::Int8 { rows } else { 0 });

@@ -112,10 +112,10 @@ impl ChunkPlan {
         let left = packed.pack(self.simd, block.qkv.weight.format(), rows, self.dim, (input, self.dim));
         self.linear(rows, left, &block.qkv, sums, |panel, product| {
             finish_block(self.simd, Epilogue::Bias, product, hidden, columns);
-            let finished =
-                packed_block.pack(self.simd, self.shape.format, rows, columns, (&hidden[..rows * columns], columns));
             let (part, column) = (panel * columns / self.dim, panel * columns % self.dim);
             let (head, dim) = (column / head_dim, column % head_dim);
+            let format = if part == 2 { self.shape.mix_format } else { self.shape.score_format };
+            let finished = packed_block.pack(self.simd, format, rows, columns, (&hidden[..rows * columns], columns));
             match part {
                 0 => store_queries(&self.shape, head, dim, finished.rows, chunk.queries),
                 1 => store_keys(self.simd, &self.shape, head, dim, finished.rows, chunk.keys),

@@ -6,12 +6,14 @@
 //! first-level cache. So a block of the transformer is one parallel loop over the chunks of all images, and scores and
 //! hidden activations never reach memory.
 //!
-//! Products are in f32, bf16, or int8 with bf16 attention; everything between them is f32.
+//! Products are in f32, in bf16 but for the scores of attention, or in int8 with bf16 attention; everything between them
+//! is f32.
 //!
 //! No sum depends on how chunks are spread over threads or on other images, so a batch gives bit for bit what single
 //! images give. Buffers are kept between calls; in the steady state only the answer is allocated.
 
 mod chunk;
+mod operation;
 #[cfg(test)]
 mod tests;
 mod weights;
@@ -31,7 +33,7 @@ use crate::types::{ImageTensor, InvalidValue};
 use chunk::{Chunk, ChunkPlan, HIDDEN_SLICE, Scratch};
 use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
-use weights::{PackedBlock, PackedLinear};
+use weights::{LayerFormats, PackedBlock, PackedLinear};
 
 /// Buffers of one call, for all images of a batch.
 #[derive(Default)]
@@ -118,14 +120,15 @@ impl FusedEncoder {
         // The embedding adds its bias to every row, the CLS row too.
         positions.iter_mut().zip(&weights.patch_embed.bias).for_each(|(position, bias)| *position -= bias);
         let shape = AttentionShape {
-            format: formats.attention,
+            score_format: formats.scores,
+            mix_format: formats.mix,
             tokens: 1 + grid.len(),
             heads: geometry.heads,
             head_dim: geometry.head_dim(),
             chunk_rows: chunk_rows(simd),
         };
         let pack =
-            |block| PackedBlock::pack((simd, formats.linear), block, geometry.dim, geometry.head_dim(), HIDDEN_SLICE);
+            |block| PackedBlock::pack((simd, formats.layers), block, geometry.dim, geometry.head_dim(), HIDDEN_SLICE);
         Ok(Self {
             spec,
             precision,
@@ -150,26 +153,32 @@ impl FusedEncoder {
         task: impl Fn(usize, &mut Chunk<'_>, (&[u32], &[u32]), &mut Scratch) + Sync,
     ) {
         let shape = &self.plan.shape;
-        let (rows_len, chunk_len, chunks) = (shape.chunk_rows * self.plan.dim, shape.chunk_len(), shape.chunks());
+        let (rows_len, chunks) = (shape.chunk_rows * self.plan.dim, shape.chunks());
+        let (keys_len, values_len) = (shape.keys_len(), shape.values_len());
         let queries_len = shape.chunk_rows * shape.query_len();
         let Workspace { tokens, queries, keys, values, next_keys, next_values, .. } = work;
         tokens.resize(images * chunks * rows_len);
         queries.resize(images * chunks * queries_len);
-        for buffer in [&mut *keys, values, next_keys, next_values] {
-            buffer.resize(images * chunks * chunk_len);
+        for (buffer, len) in [
+            (&mut *keys, keys_len),
+            (&mut *next_keys, keys_len),
+            (&mut *values, values_len),
+            (&mut *next_values, values_len),
+        ] {
+            buffer.resize(images * chunks * len);
         }
         let (image_keys, image_values): (&[u32], &[u32]) = (keys, values);
         tokens
             .par_chunks_exact_mut(rows_len)
             .zip(queries.par_chunks_exact_mut(queries_len))
-            .zip(next_keys.par_chunks_exact_mut(chunk_len))
-            .zip(next_values.par_chunks_exact_mut(chunk_len))
+            .zip(next_keys.par_chunks_exact_mut(keys_len))
+            .zip(next_values.par_chunks_exact_mut(values_len))
             .enumerate()
             .with_max_len(1)
             .for_each(|(at, (((tokens, queries), keys), values))| {
                 let (image, index) = (at / chunks, at % chunks);
-                let places = image * chunks * chunk_len..(image + 1) * chunks * chunk_len;
-                let current = (&image_keys[places.clone()], &image_values[places]);
+                let of = |len: usize| image * chunks * len..(image + 1) * chunks * len;
+                let current = (&image_keys[of(keys_len)], &image_values[of(values_len)]);
                 let mut chunk = Chunk { index, tokens, queries, keys, values };
                 self.scratches.with(|scratch| task(image, &mut chunk, current, scratch));
             });
@@ -178,18 +187,12 @@ impl FusedEncoder {
     }
 
     /// Tokens and CLS attention of every image.
-    fn run(&self, images: &[ImageTensor], work: &mut Workspace) -> Vec<EncodedImage> {
+    fn run(&self, images: &[&[f32]], work: &mut Workspace) -> Vec<EncodedImage> {
         let (plan, side) = (&self.plan, self.geometry.patch);
+        let width = self.spec.input_size.width as usize;
         let mut encoded: Vec<_> = images.iter().map(|_| self.blank()).collect();
         self.each_chunk(images.len(), work, |image, chunk, _, scratch| {
-            let image = &images[image];
-            plan.embed(
-                chunk,
-                (&image.data, image.size.width as usize, side),
-                &self.positions,
-                &self.embedding,
-                scratch,
-            );
+            plan.embed(chunk, (images[image], width, side), &self.positions, &self.embedding, scratch);
             plan.project(chunk, &self.blocks[0], scratch);
         });
         for (index, block) in self.blocks.iter().enumerate() {
@@ -210,6 +213,18 @@ impl FusedEncoder {
             }
         }
         encoded
+    }
+
+    /// Encodes pixels `[3, height, width]` of the spec's size.
+    fn encode_pixels(&self, images: &[&[f32]]) -> Result<Vec<EncodedImage>, ExtractError> {
+        if images.is_empty() {
+            return Ok(Vec::new());
+        }
+        let encoded = self.workspaces.with(|work| self.run(images, work));
+        let finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
+        let whole =
+            |image: &EncodedImage| finite(&image.tokens) && finite(&image.cls_token) && finite(&image.cls_attention);
+        if encoded.iter().all(whole) { Ok(encoded) } else { Err(ExtractError::NotFinite) }
     }
 
     fn blank(&self) -> EncodedImage {
@@ -249,7 +264,7 @@ impl FusedEncoder {
     fn read_attention(&self, image: usize, work: &mut Workspace, out: &mut EncodedImage) {
         let (simd, shape) = (self.plan.simd, &self.plan.shape);
         let queries_len = shape.chunks() * shape.chunk_rows * shape.query_len();
-        let keys_len = shape.chunks() * shape.chunk_len();
+        let keys_len = shape.chunks() * shape.keys_len();
         let queries = &work.queries[image * queries_len..(image + 1) * queries_len];
         let keys = &work.keys[image * keys_len..(image + 1) * keys_len];
         work.scores.resize(shape.scratch_len(simd) + shape.tokens);
@@ -261,10 +276,11 @@ impl FusedEncoder {
     }
 }
 
-/// Formats of the two kinds of products.
+/// Formats of all products.
 struct Formats {
-    linear: Format,
-    attention: Format,
+    layers: LayerFormats,
+    scores: Format,
+    mix: Format,
 }
 
 /// What `precision` comes to at this level; `Auto` is settled.
@@ -275,13 +291,20 @@ fn choose_formats(simd: Simd, precision: Precision) -> Result<(Precision, Format
     };
     let (int8, bf16) = (Format::Int8.is_available(simd), Format::Bf16.is_available(simd));
     match precision {
-        // Measured, not assumed: on CMU Seasons bf16 answers 94 of 100 queries right at rank 1 where f32 answers 96, and in
-        // a drawn town int8 54 of 64 where f32 answers 57. Neither may be what nobody asked for.
-        Precision::Auto => choose_formats(simd, Precision::F32),
-        Precision::F32 => Ok((precision, Formats { linear: Format::F32, attention: Format::F32 })),
-        Precision::Bf16 if bf16 => Ok((precision, Formats { linear: Format::Bf16, attention: Format::Bf16 })),
+        Precision::Auto => choose_formats(simd, if simd.has_bf16_dot() { Precision::Bf16 } else { Precision::F32 }),
+        Precision::F32 => {
+            Ok((precision, Formats { layers: LayerFormats::all(Format::F32), scores: Format::F32, mix: Format::F32 }))
+        }
+        Precision::Bf16 if bf16 => {
+            // Scores are exponents: rounded to eight bits, the largest of them lose more than all else together.
+            let layers = LayerFormats::all(Format::Bf16);
+            Ok((precision, Formats { layers, scores: Format::F32, mix: Format::Bf16 }))
+        }
         Precision::Bf16 => lacks("AVX-512 BF16"),
-        Precision::Int8 if int8 && bf16 => Ok((precision, Formats { linear: Format::Int8, attention: Format::Bf16 })),
+        Precision::Int8 if int8 && bf16 => Ok((
+            precision,
+            Formats { layers: LayerFormats::all(Format::Int8), scores: Format::Bf16, mix: Format::Bf16 },
+        )),
         Precision::Int8 => lacks("AVX-512 VNNI and BF16"),
     }
 }
@@ -303,17 +326,7 @@ impl Encoder for FusedEncoder {
 
     fn encode(&self, images: &[ImageTensor]) -> Result<Vec<EncodedImage>, ExtractError> {
         images.iter().try_for_each(|image| check_image(image, &self.spec))?;
-        if images.is_empty() {
-            return Ok(Vec::new());
-        }
-        let encoded = self.workspaces.with(|work| self.run(images, work));
-        let finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
-        if !encoded
-            .iter()
-            .all(|image| finite(&image.tokens) && finite(&image.cls_token) && finite(&image.cls_attention))
-        {
-            return Err(ExtractError::NotFinite);
-        }
-        Ok(encoded)
+        let pixels: Vec<&[f32]> = images.iter().map(|image| image.data.as_slice()).collect();
+        self.encode_pixels(&pixels)
     }
 }

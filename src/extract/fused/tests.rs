@@ -131,6 +131,31 @@ fn a_batch_gives_bit_for_bit_what_single_images_give() {
 }
 
 #[test]
+fn as_an_operation_of_candle_it_gives_the_same() {
+    use candle_core::{Device, Tensor};
+    let size = ImageSize { width: 98, height: 70 };
+    let fused = FusedEncoder::new(&small(5, true), spec(size, 1, false, 2), Simd::SCALAR, Precision::F32).unwrap();
+    let images = [image(1, size), image(2, size)];
+    let encoded = fused.encode(&images).unwrap();
+    let pixels: Vec<f32> = images.iter().flat_map(|image| image.data.iter().copied()).collect();
+    let pixels = Tensor::from_vec(pixels, (2, 3, 70, 98), &Device::Cpu).unwrap();
+    let out = pixels.apply_op1_no_bwd(&fused).unwrap();
+    assert_eq!(out.dims(), [2, 1 + 35, 64 + 2]);
+    for (number, image) in encoded.iter().enumerate() {
+        let rows = out.get(number).unwrap().to_vec2::<f32>().unwrap();
+        assert_eq!((&rows[0][..64], &rows[0][64..]), (&image.cls_token[..], &[0.0, 0.0][..]));
+        for (patch, row) in rows[1..].iter().enumerate() {
+            assert_eq!(row[..64], image.tokens[patch * 64..][..64]);
+            assert_eq!(row[64..], [image.cls_attention[patch], image.cls_attention[35 + patch]]);
+        }
+    }
+    let refused = |pixels: &Tensor| pixels.apply_op1_no_bwd(&fused).unwrap_err().to_string();
+    assert!(refused(&pixels.transpose(2, 3).unwrap()).contains("contiguous"));
+    assert!(refused(&pixels.narrow(2, 0, 14).unwrap().contiguous().unwrap()).contains("[batch, 3, 70, 98]"));
+    assert!(refused(&(pixels * f64::NAN).unwrap()).contains("not finite"));
+}
+
+#[test]
 fn a_broken_image_is_refused_and_leaves_no_trace() {
     let size = ImageSize { width: 112, height: 98 };
     for (simd, precision) in everything() {
@@ -150,7 +175,8 @@ fn a_broken_image_is_refused_and_leaves_no_trace() {
 #[test]
 fn a_precision_without_its_instructions_is_refused_by_name() {
     for simd in Simd::all() {
-        assert_eq!(choose_formats(simd, Precision::Auto).unwrap().0, Precision::F32);
+        let fastest = if simd.has_bf16_dot() { Precision::Bf16 } else { Precision::F32 };
+        assert_eq!(choose_formats(simd, Precision::Auto).unwrap().0, fastest);
         if simd.level() == SimdLevel::Avx2 {
             for precision in [Precision::Bf16, Precision::Int8] {
                 let refused = choose_formats(simd, precision).err().unwrap().to_string();

@@ -1,0 +1,19 @@
+#!/usr/bin/env bash
+# The tests that compare with stored outputs, at every level of SIMD that this CPU has. What the service falls back to on
+# an older CPU is thereby held to the same tolerances.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+bin=${BIN:-target/debug/placeformer}
+ran=0
+for level in scalar avx2 avx512; do
+    if ! refusal=$(PLACEFORMER_SIMD=$level "$bin" model info 2>&1 >/dev/null); then
+        case $refusal in
+            *'goes no further than'*) echo "left out on this CPU: $level" && continue ;;
+            *) printf '%s\n' "$refusal" >&2 && exit 1 ;;
+        esac
+    fi
+    echo "level $level"
+    PLACEFORMER_SIMD=$level cargo nextest run --locked --test golden_extract --lib -E 'binary(golden_extract) or test(golden)'
+    ran=$((ran + 1))
+done
+[ "$ran" -gt 0 ]
