@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 const FILE: &str = "application/octet-stream";
 /// References that are there from the beginning; more than the store converts at a time.
-const FIRST: u64 = 600;
+const FIRST: u64 = 540;
 /// A picture of nowhere, about as far from every reference.
 const STRANGE: u64 = 1 << 40;
 
@@ -79,7 +79,7 @@ async fn keep_asking(
 /// Adds and deletes until told to stop; the seeds of what stays and of what went.
 async fn keep_changing(app: &App, models: &BTreeSet<String>, stop: &AtomicBool) -> (Vec<u64>, Vec<u64>) {
     let (mut stay, mut gone) = (Vec::new(), Vec::new());
-    for seed in 10_000..10_300 {
+    for seed in 10_000..10_100 {
         if stop.load(Ordering::SeqCst) {
             break;
         }
