@@ -26,14 +26,14 @@ demo: ## Serve a demo map, query it, leave a report in demo-report/
 	$(RELEASE_BIN) demo --out demo-report
 
 .PHONY: head
-head: ## Make the default projection head again (models/)
+head: ## Choose the default projection head again (CAMVID=DIR; models/)
 	cargo build --release --locked
-	PLACEFORMER=$(RELEASE_BIN) models/make_head.sh
+	CAMVID="$(CAMVID)" PLACEFORMER=$(RELEASE_BIN) models/make_head.sh
 
 .PHONY: calibration
-calibration: ## Fit the default model's calibration again (models/)
+calibration: ## Fit the default model's calibration again (CAMVID=DIR; models/)
 	cargo build --release --locked
-	PLACEFORMER=$(RELEASE_BIN) models/make_calibration.sh
+	CAMVID="$(CAMVID)" PLACEFORMER=$(RELEASE_BIN) models/make_calibration.sh
 
 .PHONY: bench
 bench: ## Measure every stage beside its baselines

@@ -36,6 +36,17 @@ class Layout:
         self.link("queries", name, source)
         self.rows += [(name, reference) for reference in positives or [""]]
 
+    def write_truth(self):
+        with open(self.out / "ground_truth.csv", "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(("query", "reference"))
+            writer.writerows(self.rows)
+
+    def counts(self):
+        unknown = sum(1 for _, reference in self.rows if not reference)
+        known = len({query for query, reference in self.rows if reference})
+        return f"{known} queries of mapped places, {unknown} of others"
+
 
 def thinned(frames):
     kept, last = [], None
@@ -91,13 +102,8 @@ def main():
         add_town(layout, folder)
     for folder in args.stranger:
         add_stranger(layout, folder)
-    with open(args.out / "ground_truth.csv", "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("query", "reference"))
-        writer.writerows(layout.rows)
-    unknown = sum(1 for _, reference in layout.rows if not reference)
-    known = len({query for query, reference in layout.rows if reference})
-    print(f"{args.out}: {known} queries of mapped places, {unknown} of others")
+    layout.write_truth()
+    print(f"{args.out}: {layout.counts()}")
 
 
 if __name__ == "__main__":

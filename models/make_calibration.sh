@@ -5,15 +5,18 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 placeformer=${PLACEFORMER:-target/release/placeformer}
-camvid=${CAMVID:-../shared/data/camvid}
-[ -d "$camvid" ] || { echo "no photographs in $camvid; set CAMVID" >&2; exit 1; }
+if [ -z "${CAMVID:-}" ] || [ ! -d "$CAMVID" ]; then
+  echo "say where the photographs are: make calibration CAMVID=DIR, a folder with one folder of frames in order per drive" >&2
+  echo "(the four CamVid drives were used)${CAMVID:+; there is no $CAMVID}" >&2
+  exit 1
+fi
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 # Town 1 is among the pictures that the head was fitted on, town 7 is the demo's.
 for town in 11 12 13; do
   "$placeformer" synth --out "$work/town$town" --places 40 --views 2 --seed "$town"
 done
-python3 models/calibration_data.py "$work/data" --drives "$camvid" \
+python3 models/calibration_data.py "$work/data" --drives "$CAMVID" \
   --town "$work/town11" --town "$work/town12" --stranger "$work/town13"
 "$placeformer" eval calibrate --dataset csv --root "$work/data" \
   --data-name "four CamVid drives and two drawn towns, with stretches and a town that are not mapped" \

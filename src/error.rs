@@ -68,6 +68,8 @@ error_codes! {
     ModelMismatch = "model_mismatch", 409, false, "The map was built with another model";
     /// The calibration belongs to another model or another re-ranking.
     CalibrationMismatch = "calibration_mismatch", 409, false, "The calibration was fitted for something else";
+    /// The head is made for other tokens than the map keeps, or pools them otherwise.
+    HeadMismatch = "head_mismatch", 409, false, "The head does not fit the map";
     /// The body is larger than allowed.
     BodyTooLarge = "body_too_large", 413, false, "The body is too large";
     /// The image has more pixels, or a longer side, than allowed.
@@ -76,6 +78,8 @@ error_codes! {
     UnsupportedMediaType = "unsupported_media_type", 415, false, "The media type is not supported";
     /// The bytes are not a readable image.
     ImageUndecodable = "image_undecodable", 422, false, "The image cannot be decoded";
+    /// The bytes are not a head.
+    HeadUnreadable = "head_unreadable", 422, false, "The head cannot be read";
     /// The key has used up its rate.
     RateLimited = "rate_limited", 429, true, "Too many requests with this key";
     /// The request asked for nothing the server could finish before its client left.

@@ -4,7 +4,7 @@
 mod places;
 
 use placeformer::error::ErrorCode;
-use placeformer::store::{Inserted, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, StoreError};
+use placeformer::store::{Inserted, NewHead, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, StoreError};
 use placeformer::types::{
     Calibration, ConfidenceCurve, ConfidenceWeights, GLOBAL_DIM, MapName, ModelId, NewReference, Reference,
     ReferenceId, RerankId,
@@ -53,6 +53,11 @@ fn globals(store: &SqliteStore, map: &MapName) -> BTreeMap<ReferenceId, Vec<f32>
     let mut rows = BTreeMap::new();
     store.scan_globals(map, &mut |row| assert!(rows.insert(row.reference, row.global).is_none())).unwrap();
     rows
+}
+
+/// A head that a map is to keep.
+fn new_head(model: &str) -> NewHead {
+    NewHead { model: ModelId::new(model), file: Some(format!("the head of {model}").into_bytes()) }
 }
 
 #[test]
@@ -294,9 +299,10 @@ fn another_head_replaces_all_vectors_or_none_while_the_map_grows() {
     assert!(store.insert_many(new).iter().all(Result::is_ok));
     store.set_calibration(&city, Some(calibration(MODEL))).unwrap();
     let old = globals(&store, &city);
-    let wrong = store.replace_globals(&city, ModelId::new("new"), &mut |_| vec![0.0; 7]);
+    let wrong = store.replace_globals(&city, new_head("wrong"), &mut |_: &[f32]| vec![0.0; 7]);
     assert!(matches!(wrong, Err(StoreError::InvalidDescriptor { .. })));
     assert_eq!((globals(&store, &city), store.map(&city).unwrap().model.as_str()), (old, MODEL));
+    assert_eq!(store.head(&city).unwrap(), None);
 
     let mut calls = 0;
     let mut compute = |pooled: &[f32]| {
@@ -306,13 +312,13 @@ fn another_head_replaces_all_vectors_or_none_while_the_map_grows() {
             let first = store.list(Some(&city), None, 1).unwrap().references[0].id;
             store.delete(first).unwrap();
             assert!(matches!(
-                store.replace_globals(&city, ModelId::new("third"), &mut |_| Vec::new()),
+                store.replace_globals(&city, new_head("third"), &mut |_: &[f32]| Vec::new()),
                 Err(StoreError::ReheadInProgress { .. })
             ));
         }
         pooled[..GLOBAL_DIM].to_vec()
     };
-    store.replace_globals(&city, ModelId::new("new"), &mut compute).unwrap();
+    store.replace_globals(&city, new_head("new"), &mut compute).unwrap();
     let info = store.map(&city).unwrap();
     assert_eq!((info.model.as_str(), info.references), ("new", 700));
     assert_eq!(info.calibration, None);
@@ -323,6 +329,41 @@ fn another_head_replaces_all_vectors_or_none_while_the_map_grows() {
     assert!(matches!(store.insert(reference(&city, 9001)), Err(StoreError::ModelMismatch { .. })));
     let report = store.verify().unwrap();
     assert_eq!((report.damaged, report.engine_errors), (vec![], vec![]));
+}
+
+#[test]
+fn a_map_keeps_its_head_until_it_gets_another_or_goes() {
+    let (directory, store) = fresh();
+    let (city, other) = (map("city"), map("other"));
+    create(&store, reference(&city, 1));
+    create(&store, reference(&other, 1));
+    let mut project = |pooled: &[f32]| pooled[..GLOBAL_DIM].to_vec();
+    store.replace_globals(&city, new_head("new"), &mut project).unwrap();
+    assert_eq!((store.head(&city).unwrap(), store.head(&other).unwrap()), (new_head("new").file, None));
+    drop(store);
+    let store = open(&directory);
+    assert_eq!(store.head(&city).unwrap(), new_head("new").file);
+    store.replace_globals(&city, new_head("newer"), &mut project).unwrap();
+    assert_eq!(store.head(&city).unwrap(), new_head("newer").file);
+    let servers = NewHead { model: ModelId::new(MODEL), file: None };
+    store.replace_globals(&city, servers, &mut project).unwrap();
+    assert_eq!((store.head(&city).unwrap(), store.map(&city).unwrap().model.as_str()), (None, MODEL));
+    store.replace_globals(&city, new_head("last"), &mut project).unwrap();
+    store.delete_map(&city).unwrap();
+    assert!(matches!(store.head(&city), Err(StoreError::MapNotFound { .. })));
+    // What is retired is removed in the background.
+    let database = directory.path().join("placeformer.db");
+    let heads = || {
+        let connection = rusqlite::Connection::open(&database).unwrap();
+        connection.query_row("SELECT count(*) FROM map_head", [], |row| row.get::<_, i64>(0)).unwrap()
+    };
+    for _ in 0..500 {
+        if heads() == 0 {
+            return;
+        }
+        std::thread::sleep(std::time::Duration::from_millis(10));
+    }
+    panic!("{} heads are left", heads());
 }
 
 #[test]

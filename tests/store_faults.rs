@@ -5,7 +5,7 @@ mod places;
 #[path = "common/small_disk.rs"]
 mod small_disk;
 
-use placeformer::store::{Inserted, PlaceStore, SqliteStore, StoreConfig, StoreError, codec, crash_points};
+use placeformer::store::{Inserted, NewHead, PlaceStore, SqliteStore, StoreConfig, StoreError, codec, crash_points};
 use placeformer::types::{GLOBAL_DIM, MapName, ModelId, NewReference, Reference, ReferenceId};
 use places::{MODEL, map, named_reference, reference};
 use rand::{RngExt, SeedableRng};
@@ -38,6 +38,9 @@ fn say(line: &str) {
     std::io::stdout().write_all(format!("{line}\n").as_bytes()).unwrap();
 }
 
+/// The head that the map gets.
+const HEAD: &[u8] = b"stands for the head that the map keeps";
+
 /// Not a test of its own: what the process does that the test below kills.
 #[test]
 fn child_that_writes_until_it_is_killed() {
@@ -57,7 +60,8 @@ fn child_that_writes_until_it_is_killed() {
         }
     });
     say("\nrehead");
-    store.replace_globals(&map("lasting"), ModelId::new("new"), &mut |p| p[..GLOBAL_DIM].to_vec()).unwrap();
+    let head = NewHead { model: ModelId::new("new"), file: Some(HEAD.to_vec()) };
+    store.replace_globals(&map("lasting"), head, &mut |pooled: &[f32]| pooled[..GLOBAL_DIM].to_vec()).unwrap();
     say("\nreheaded");
     store.delete_map(&map("doomed")).unwrap();
     say("\ndeleted");
@@ -99,6 +103,9 @@ fn check_what_is_left(directory: &Path, said: &str, point: &str) {
         store.scan_globals(&info.name, &mut |_| vectors += 1).unwrap();
         assert_eq!(vectors, info.references, "{point}");
         assert!(info.model.as_str() == "new" || info.model.as_str() == MODEL && !reheaded, "{point}: {}", info.model);
+        // The head comes with the vectors that it made, whole, or neither does.
+        let head = (info.model.as_str() == "new").then(|| HEAD.to_vec());
+        assert_eq!(store.head(&info.name).unwrap(), head, "{point}");
     }
     assert!(!said.contains("\ndeleted") || store.map(&map("doomed")).is_err(), "{point}");
     for reference in store.list(None, None, 10_000).unwrap().references {
@@ -219,6 +226,28 @@ fn a_damaged_part_is_noticed_quarantined_and_healed_by_sending_the_image_again()
         assert_eq!((store.quarantined().unwrap(), store.map(&city).unwrap().references), (vec![], 5), "{part}");
         assert_eq!(store.verify().unwrap().damaged, [], "{part}");
     }
+}
+
+#[test]
+fn a_damaged_head_is_noticed_and_healed_by_giving_it_again() {
+    let city = map("city");
+    let directory = tempfile::tempdir().unwrap();
+    let store = open(directory.path());
+    let created = create(&store, reference(&city, 1));
+    let head = || NewHead { model: ModelId::new("new"), file: Some(HEAD.to_vec()) };
+    let mut project = |pooled: &[f32]| pooled[..GLOBAL_DIM].to_vec();
+    store.replace_globals(&city, head(), &mut project).unwrap();
+    drop(store);
+    flip(directory.path(), HEAD);
+    let store = open(directory.path());
+    assert!(matches!(store.head(&city), Err(StoreError::CorruptHead { .. })));
+    let report = store.verify().unwrap();
+    assert_eq!((report.damaged.len(), report.engine_errors.len()), (0, 1));
+    assert!(report.engine_errors[0].contains("city"), "{:?}", report.engine_errors);
+    assert_eq!(store.get(created.id).unwrap().model.as_str(), "new");
+    store.replace_globals(&city, head(), &mut project).unwrap();
+    assert_eq!(store.head(&city).unwrap().as_deref(), Some(HEAD));
+    assert_eq!(store.verify().unwrap().engine_errors, Vec::<String>::new());
 }
 
 #[test]

@@ -6,9 +6,10 @@
 
 use super::scenes::index_entry;
 use crate::store::{
-    GlobalRow, Inserted, MapInfo, Page, PlaceStore, Quarantined, ReferencePatch, StoreError, VerifyReport,
+    GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined, ReferencePatch, StoreError,
+    VerifyReport,
 };
-use crate::types::{Calibration, ExternalId, MapName, ModelId, NewReference, PackedPatches, Reference, ReferenceId};
+use crate::types::{Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId};
 use rayon::prelude::*;
 use std::path::Path;
 
@@ -102,13 +103,12 @@ impl<S: PlaceStore> PlaceStore for FilledStore<S> {
         self.store.scan_globals(map, visit)
     }
 
-    fn replace_globals(
-        &self,
-        map: &MapName,
-        new_model: ModelId,
-        compute: &mut dyn FnMut(&[f32]) -> Vec<f32>,
-    ) -> Result<(), StoreError> {
-        self.store.replace_globals(map, new_model, compute)
+    fn replace_globals(&self, map: &MapName, head: NewHead, exchange: &mut dyn HeadExchange) -> Result<(), StoreError> {
+        self.store.replace_globals(map, head, exchange)
+    }
+
+    fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError> {
+        self.store.head(map)
     }
 
     fn set_calibration(&self, map: &MapName, calibration: Option<Calibration>) -> Result<(), StoreError> {
@@ -137,7 +137,7 @@ mod tests {
     use super::*;
     use crate::bench::scenes::made_up_id;
     use crate::store::{SqliteStore, StoreConfig};
-    use crate::types::{ContentHash, Descriptor, GLOBAL_DIM, PatchGrid, PoolingStride, ReferenceFields};
+    use crate::types::{ContentHash, Descriptor, GLOBAL_DIM, ModelId, PatchGrid, PoolingStride, ReferenceFields};
 
     fn reference(map: &MapName) -> NewReference {
         let grid = PatchGrid { columns: 8, rows: 6, patch_px: 14, stride: PoolingStride::Kernel };

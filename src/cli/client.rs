@@ -49,6 +49,12 @@ impl ServerClient {
         self.json(self.client.put(self.url(path)).json(body))
     }
 
+    /// A PUT of a file's bytes.
+    pub fn put_file(&self, path: &str, file: &[u8]) -> anyhow::Result<Value> {
+        let request = self.client.put(self.url(path)).header("content-type", "application/octet-stream");
+        self.json(request.body(file.to_vec()))
+    }
+
     /// A POST of an image file with query parameters.
     pub fn post_image(&self, path: &str, image: &Path, parameters: &[(&str, String)]) -> anyhow::Result<Value> {
         let bytes = std::fs::read(image).with_context(|| format!("cannot read {}", image.display()))?;

@@ -31,8 +31,8 @@ enum HeadCommand {
     Fit(FitArgs),
     /// Train a head on places with triplets; the same as `train --trainable head`.
     ///
-    /// Every image is encoded once and its pooled tokens are kept in the run's folder, so that a step costs a matrix
-    /// product: minutes on a CPU. The head that --head names is where it starts, and says how tokens are pooled.
+    /// Every image is encoded once and its pooled tokens are kept in the user's cache (--cache), so that a step costs a
+    /// matrix product: minutes on a CPU. The head that --head names is where it starts, and says how tokens are pooled.
     Train(HeadTrainArgs),
 }
 

@@ -1,15 +1,17 @@
-//! Inspect and delete maps of a running server; give maps in a data directory another head.
+//! Inspect and delete maps of a running server; give maps another head, there or in a data directory.
 
 use super::client::{ServerArgs, ServerClient};
 use crate::extract::Head;
-use crate::store::StoreConfig;
+use crate::store::{HeadExchange, NewHead, StoreConfig};
 use crate::types::MapName;
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use clap::Subcommand;
 use indicatif::{ProgressBar, ProgressStyle};
+use rayon::prelude::*;
 use serde_json::Value;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
@@ -51,21 +53,36 @@ enum Action {
     /// The head must be made for the map's backbone and pool tokens as the map's old head did: a mean cannot become a
     /// VLAD, nor one generalised mean another, without the images. Such a head is refused.
     ///
-    /// The data directory must not be in use: stop the server first. A server runs one model, so start it again with
-    /// the same head (extract.head, or PLACEFORMER_EXTRACT__HEAD=FILE); it answers 409 for maps of another model, so
-    /// name every map it is to serve. For a change without a pause, do this on a backup of the data directory and let
-    /// a second server with the new head take over.
-    Rehead {
-        /// The maps.
-        #[arg(required = true, value_name = "MAP")]
-        maps: Vec<MapName>,
-        /// The new head, as `head fit`, `head train` or `train` wrote it.
-        #[arg(long, value_name = "FILE")]
-        head: PathBuf,
-        /// Data directory of the stopped server.
-        #[arg(long, value_name = "DIR")]
-        data: PathBuf,
-    },
+    /// A map keeps its head, whatever head its server runs. Through a running server, queries are answered throughout:
+    /// with the old head until all is ready, with the new one from then on.
+    Rehead(ReheadArgs),
+}
+
+#[derive(Debug, clap::Args)]
+#[command(group(clap::ArgGroup::new("target").required(true).args(["server", "data"])))]
+#[command(group(clap::ArgGroup::new("wish").required(true).args(["head", "server_head"])))]
+struct ReheadArgs {
+    /// The maps.
+    #[arg(required = true, value_name = "MAP")]
+    maps: Vec<MapName>,
+    /// The new head, as `head fit`, `head train` or `train` wrote it.
+    #[arg(long, value_name = "FILE")]
+    head: Option<PathBuf>,
+    /// Let the maps go with the head that the server runs; also brings over maps that a server with another head made.
+    #[arg(long, conflicts_with = "data")]
+    server_head: bool,
+    /// The running server.
+    #[arg(long, value_name = "URL")]
+    server: Option<String>,
+    /// Data directory of a stopped server.
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
+    /// API key, where the server wants one.
+    #[arg(long, env = "PLACEFORMER_API_KEY", hide_env_values = true, value_name = "KEY")]
+    api_key: Option<String>,
+    /// Seconds to wait for one map. A server that is no longer waited for goes on all the same.
+    #[arg(long, default_value_t = 3600, value_name = "SECONDS")]
+    timeout: u64,
 }
 
 /// Runs it.
@@ -78,7 +95,7 @@ pub fn run(args: MapArgs) -> anyhow::Result<()> {
             Ok(())
         }
         Action::Delete { map, yes, server } => delete(&ServerClient::new(server)?, &map, yes),
-        Action::Rehead { maps, head, data } => rehead(&maps, &head, &data),
+        Action::Rehead(args) => rehead(args),
     }
 }
 
@@ -112,8 +129,41 @@ fn confirmed(map: &MapName, references: &Value) -> io::Result<bool> {
     Ok(line.trim() == map.as_str())
 }
 
-fn rehead(maps: &[MapName], head: &Path, data: &Path) -> anyhow::Result<()> {
-    let head = Head::load(head)?;
+fn rehead(args: ReheadArgs) -> anyhow::Result<()> {
+    let ReheadArgs { maps, head, server, data, api_key, timeout, .. } = args;
+    // Read here first, so that a file that is no head is told by its name and before any map is touched.
+    let head = head.map(|path| read_head(&path)).transpose()?;
+    match (server, data, head) {
+        (Some(server), _, head) => {
+            let client = ServerClient::new(ServerArgs { server, api_key, timeout })?;
+            rehead_live(&client, &maps, head.map(|(_, file)| file).as_deref())
+        }
+        (None, Some(data), Some((head, file))) => rehead_stopped(&maps, &head, &file, &data),
+        // The groups of the arguments leave nothing else.
+        _ => bail!("give --head with --data, or --head or --server-head with --server"),
+    }
+}
+
+fn read_head(path: &Path) -> anyhow::Result<(Head, Vec<u8>)> {
+    let file = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    Ok((Head::from_bytes(&file, path)?, file))
+}
+
+fn rehead_live(client: &ServerClient, maps: &[MapName], file: Option<&[u8]>) -> anyhow::Result<()> {
+    for map in maps {
+        let (path, begun) = (format!("/maps/{map}/head"), Instant::now());
+        let answer = match file {
+            Some(file) => client.put_file(&path, file),
+            None => client.delete(&path),
+        };
+        let answer = answer.with_context(|| format!("map {map} was not given another head"))?;
+        let (references, model) = (&answer["references"], answer["model"].as_str().unwrap_or_default());
+        println!("map {map}: {references} references, now {model} ({:.1} s)", begun.elapsed().as_secs_f64());
+    }
+    Ok(())
+}
+
+fn rehead_stopped(maps: &[MapName], head: &Head, file: &[u8], data: &Path) -> anyhow::Result<()> {
     ensure!(data.is_dir(), "there is no store in {}", data.display());
     let store = super::serve::open_store(data, &StoreConfig::default())?;
     // All are looked at before any is changed.
@@ -124,20 +174,29 @@ fn rehead(maps: &[MapName], head: &Path, data: &Path) -> anyhow::Result<()> {
         plan.push((info, model));
     }
     for (info, model) in plan {
-        if info.model == model {
+        // One that is kept damaged is given again.
+        if info.model == model && matches!(store.head(&info.name), Ok(Some(_))) {
             println!("map {} has this head already: {model}", info.name);
             continue;
         }
         let style = ProgressStyle::with_template("projecting {wide_bar} {pos}/{len} {per_sec} {eta}")?;
         let bar = ProgressBar::new(info.references).with_style(style);
-        let mut project = |pooled: &[f32]| {
-            bar.inc(1);
-            // The store refuses an empty vector by name, which is what a stored one of another length deserves.
-            if pooled.len() == head.dim() { head.project(pooled) } else { Vec::new() }
-        };
-        store.replace_globals(&info.name, model.clone(), &mut project)?;
+        let new = NewHead { model: model.clone(), file: Some(file.to_vec()) };
+        store.replace_globals(&info.name, new, &mut Projecting { head, bar: &bar })?;
         bar.finish_and_clear();
         println!("map {}: {} references, now {model}", info.name, info.references);
     }
     Ok(())
+}
+
+struct Projecting<'a> {
+    head: &'a Head,
+    bar: &'a ProgressBar,
+}
+
+impl HeadExchange for Projecting<'_> {
+    fn project(&mut self, pooled: &[Vec<f32>]) -> Vec<Vec<f32>> {
+        self.bar.inc(pooled.len() as u64);
+        pooled.par_iter().map(|pooled| self.head.project_stored(pooled)).collect()
+    }
 }

@@ -177,15 +177,33 @@ impl Head {
         global
     }
 
+    /// As [`Head::project`], for a vector from a store: one of another length gives an empty vector, which the store
+    /// refuses by name.
+    pub fn project_stored(&self, pooled: &[f32]) -> Vec<f32> {
+        if pooled.len() == self.dim { self.project(pooled) } else { Vec::new() }
+    }
+
     /// W x + b, before normalisation.
     pub(super) fn affine(&self, pooled: &[f32]) -> Vec<f64> {
         assert_eq!(pooled.len(), self.dim, "a head takes tokens of its own width");
-        let row = |(row, &bias): (&[f32], &f32)| {
-            row.iter().zip(pooled).map(|(&w, &x)| w as f64 * x as f64).sum::<f64>() + bias as f64
-        };
-        self.weight.chunks_exact(self.dim).zip(&self.bias).map(row).collect()
+        let mut projected = Vec::with_capacity(GLOBAL_DIM);
+        // Each sum waits for its last addition, so rows are summed side by side: whole maps pass through here.
+        for (rows, biases) in self.weight.chunks_exact(ROWS * self.dim).zip(self.bias.chunks_exact(ROWS)) {
+            let mut sums = [0f64; ROWS];
+            for (k, &x) in pooled.iter().enumerate() {
+                for (r, sum) in sums.iter_mut().enumerate() {
+                    *sum += f64::from(rows[r * self.dim + k]) * f64::from(x);
+                }
+            }
+            projected.extend(sums.iter().zip(biases).map(|(sum, &bias)| sum + f64::from(bias)));
+        }
+        projected
     }
 }
+
+/// Rows of the weight that are summed side by side; divides their number.
+const ROWS: usize = 8;
+const _: () = assert!(GLOBAL_DIM.is_multiple_of(ROWS));
 
 const GEM_P: &str = "gem_p";
 const VLAD_WORDS: &str = "vlad_words";

@@ -45,6 +45,11 @@ pub fn document() -> Value {
         {"name": "service", "description": "What runs here, and how it is."},
     ]);
     describe_uploads(&mut document);
+    document["paths"]["/maps/{map}/head"]["put"]["requestBody"] = json!({
+        "required": true,
+        "description": "The head's safetensors file, at most 32 MiB.",
+        "content": {"application/octet-stream": binary()},
+    });
     for (path, method, operation) in operations(&mut document) {
         add_errors(operation, &errors_of(&path, &method));
         if !is_public(&path) {
@@ -100,6 +105,13 @@ fn errors_of(path: &str, method: &str) -> Vec<ErrorCode> {
         ("/references/{id}", _) => &[&[ReferenceNotFound, CorruptRecord, DiskFull]],
         ("/maps/{map}/calibration", "put") => &[&sent, &[MapNotFound, CalibrationMismatch, DiskFull]],
         ("/maps/{map}/calibration", _) => &[&[MapNotFound, DiskFull]],
+        ("/maps/{map}/head", "put") => &[
+            &sent,
+            &[MapNotFound, HeadUnreadable, HeadMismatch, ModelMismatch, CorruptRecord, MemoryPressure, DiskFull],
+        ],
+        ("/maps/{map}/head", _) => {
+            &[&[MapNotFound, HeadMismatch, ModelMismatch, CorruptRecord, Overloaded, MemoryPressure, DiskFull]]
+        }
         ("/maps/{map}", _) => &[&[MapNotFound, DiskFull]],
         _ => &[],
     };
@@ -150,7 +162,7 @@ fn describe_uploads(document: &mut Value) {
         ("/match", schema_value::<routes::match_images::MatchParams>(), &["query", "reference"], &["query"]),
     ];
     for (path, params, images, required) in uploads {
-        let raw = json!({"schema": {"type": "string", "format": "binary", "minLength": 1}});
+        let raw = binary();
         let mut form = json!({"type": "object", "additionalProperties": false, "required": [images[0]], "properties": {
             "json": params,
         }});
@@ -172,6 +184,11 @@ fn describe_uploads(document: &mut Value) {
             },
         });
     }
+}
+
+/// A body that is bytes.
+fn binary() -> Value {
+    json!({"schema": {"type": "string", "format": "binary", "minLength": 1}})
 }
 
 fn json_example(path: &str) -> Value {

@@ -1,8 +1,8 @@
 //! Changing and deleting references and maps, in the store and in the index together.
 
 use super::blocking::blocking;
+use super::maps::Change;
 use super::{PipelineError, Service};
-use crate::search::IndexEntry;
 use crate::store::ReferencePatch;
 use crate::types::{Calibration, MapName, Reference, ReferenceFields, ReferenceId};
 use std::sync::Arc;
@@ -39,12 +39,11 @@ impl Service {
         let entry = self.maps.entry(&self.store.get(id)?.map);
         let _changing = entry.changing();
         let reference = self.store.update(id, patch)?;
-        // Only what is in the index moves; a map of another model is not.
-        if let Some(live) = entry.live().filter(|_| moves)
-            && let Some(global) = live.index.global(id)
-        {
+        if moves {
             let ReferenceFields { location, captured_at, .. } = reference.fields;
-            live.index.insert(IndexEntry { id, global, location, captured_at });
+            let change = || Change::Moved(id, location, captured_at);
+            entry.live().iter().for_each(|live| change().apply(&live.index));
+            entry.note(change());
         }
         Ok(reference)
     }
@@ -56,6 +55,7 @@ impl Service {
         if let Some(live) = entry.live() {
             live.index.remove(id);
         }
+        entry.note(Change::Deleted(id));
         self.patches.forget(id);
         Ok(reference)
     }
@@ -82,7 +82,7 @@ impl Service {
     }
 
     /// Runs a write to its end even if the caller goes away meanwhile: store and index change together.
-    async fn write<T: Send + 'static>(
+    pub(super) async fn write<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&Self) -> Result<T, PipelineError> + Send + 'static,
     ) -> Result<T, PipelineError> {

@@ -38,6 +38,17 @@ pub enum PipelineError {
         /// What is loaded.
         server_model: ModelId,
     },
+    /// What was sent is not a head.
+    #[error("what was sent is not a head")]
+    HeadUnreadable(#[source] ExtractError),
+    /// The map's pooled vectors, or this server's, cannot pass through the head.
+    #[error("map {map} cannot take this head")]
+    HeadMismatch {
+        /// The map.
+        map: MapName,
+        /// Why not.
+        source: ExtractError,
+    },
     /// The calibration was fitted on scores of another re-ranking.
     #[error("the calibration for map {map} was fitted for re-ranking \"{given}\", this server's is \"{server}\"")]
     RerankMismatch {
@@ -98,6 +109,8 @@ impl PipelineError {
             Self::Invalid(_) => ErrorCode::InvalidParameter,
             Self::MapNotFound(_) => ErrorCode::MapNotFound,
             Self::ModelMismatch { .. } => ErrorCode::ModelMismatch,
+            Self::HeadUnreadable(_) => ErrorCode::HeadUnreadable,
+            Self::HeadMismatch { .. } => ErrorCode::HeadMismatch,
             Self::RerankMismatch { .. } => ErrorCode::CalibrationMismatch,
             Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
             Self::Overloaded { .. } => ErrorCode::Overloaded,

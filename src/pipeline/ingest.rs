@@ -110,9 +110,15 @@ impl Service {
         }
     }
 
-    fn commit(&self, new: NewReference) -> Result<Inserted, PipelineError> {
+    fn commit(&self, mut new: NewReference) -> Result<Inserted, PipelineError> {
         let entry = self.maps.entry(&new.map);
         let _inserting = entry.inserting();
+        // The map may have been given another head since the request was let in.
+        if let Some(live) = entry.live() {
+            live.check_model(&new.map, &new.model)?;
+            new.descriptor.global = live.global_of(&new.descriptor).into_owned();
+            new.model = live.model.clone();
+        }
         let model = new.model.clone();
         let (global, patch_bytes) = (new.descriptor.global.clone(), new.descriptor.patches.heap_bytes());
         let inserted = self.store.insert(new).inspect_err(|error| {

@@ -20,6 +20,7 @@ mod maps;
 mod match_images;
 mod patches;
 mod query;
+mod rehead;
 mod service;
 mod source;
 mod startup;

@@ -126,7 +126,7 @@ impl Service {
     fn rank(&self, plan: &Plan, query: &Descriptor, mut timings: Timings) -> Result<QueryAnswer, PipelineError> {
         let started = Instant::now();
         let fetched = if plan.rerank { plan.candidates.max(plan.top_k) } else { plan.top_k };
-        let neighbours = plan.map.index.search(&query.global, fetched, &plan.filter);
+        let neighbours = plan.map.index.search(&plan.map.global_of(query), fetched, &plan.filter);
         timings.record(&self.metrics, Stage::Search, started.elapsed());
         let reranked = if plan.rerank { self.rerank(plan, query, &neighbours, &mut timings)? } else { None };
         let was_reranked = reranked.is_some();
@@ -134,7 +134,7 @@ impl Service {
             reranked.unwrap_or_else(|| neighbours.iter().map(|&neighbour| Placed { neighbour, score: None }).collect());
         let results = self.with_metadata(placed, plan.top_k)?;
         let best = results.first();
-        let verdict = self.trust.judge(plan.map.calibration().as_deref(), best);
+        let verdict = self.trust.judge(&plan.map.model, plan.map.calibration().as_deref(), best);
         let top1 = best.and_then(|best| best.score.as_ref()).map_or(0, |score| score.spatial_score);
         self.metrics.query_answered(was_reranked.then_some(top1), verdict.matched);
         Ok(QueryAnswer { results, reranked: was_reranked, verdict, timings, model: plan.map.model.clone() })

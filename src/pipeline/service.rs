@@ -53,12 +53,13 @@ pub struct ServiceInfo {
 impl Service {
     /// What this server computes with.
     pub fn info(&self) -> ServiceInfo {
+        let model = self.extraction.source().model_id();
         ServiceInfo {
-            model: self.extraction.source().model_id().clone(),
+            model: model.clone(),
             input_size: self.extraction.source().input_size(),
             rerank: self.rerank_config.clone(),
             pipeline: self.config.clone(),
-            calibration: self.trust.built_in().cloned(),
+            calibration: self.trust.built_in(model).cloned(),
         }
     }
 

@@ -1,12 +1,14 @@
 //! The seam between the pipeline and the model, so that tests of the service need no weights.
 
-use crate::extract::{ExtractError, Extractor};
+use crate::extract::{ExtractError, Extractor, Head};
 use crate::types::{Descriptor, ImageSize, ImageTensor, ModelId};
 
 /// What turns images into descriptors. Production uses [`Extractor`].
 pub trait DescriptorSource: Send + Sync + 'static {
     /// What its descriptors may be compared with.
     fn model_id(&self) -> &ModelId;
+    /// The head behind its global descriptors; without one they are the pooled tokens.
+    fn head(&self) -> Option<&Head>;
     /// The size images must be resized to.
     fn input_size(&self) -> ImageSize;
     /// One descriptor per image. Blocks for the whole computation.
@@ -18,6 +20,10 @@ pub trait DescriptorSource: Send + Sync + 'static {
 impl DescriptorSource for Extractor {
     fn model_id(&self) -> &ModelId {
         Extractor::model_id(self)
+    }
+
+    fn head(&self) -> Option<&Head> {
+        Extractor::head(self)
     }
 
     fn input_size(&self) -> ImageSize {

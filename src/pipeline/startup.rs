@@ -2,17 +2,19 @@
 
 use super::admission::Admission;
 use super::extraction::Extraction;
-use super::maps::{LiveMap, MapEntry, Maps};
+use super::maps::{LiveMap, MapEntry, Maps, Projection};
 use super::patches::PatchCache;
 use super::trust::Trust;
 use super::{DescriptorSource, PipelineConfig, PipelineError, Service};
+use crate::extract::Head;
 use crate::image::ImageConfig;
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::{Health, Metrics};
 use crate::rerank::{RerankConfig, Reranker};
 use crate::search::{IndexEntry, MapIndex};
-use crate::store::{MapInfo, PlaceStore};
+use crate::store::{GlobalRow, MapInfo, PlaceStore, StoreError};
 use rayon::prelude::*;
+use std::path::Path;
 use std::sync::Arc;
 
 /// References between two reports of progress.
@@ -40,7 +42,7 @@ impl Service {
     /// Builds the indexes and opens for requests. Blocks until all maps can be searched.
     pub fn start(parts: Parts) -> Result<Arc<Self>, PipelineError> {
         parts.pipeline.check()?;
-        let trust = Trust::new(parts.source.model_id(), parts.rerank.id());
+        let trust = Trust::new(parts.rerank.id());
         let maps = build_indexes(&*parts.store, &*parts.source, &parts.health)?;
         for (name, live) in maps.all() {
             trust.warn_if_useless(&name, live.calibration().as_deref());
@@ -82,27 +84,59 @@ fn build_index(
     info: &MapInfo,
     entry: &MapEntry,
 ) -> Result<(), PipelineError> {
+    let projection = projection(store, source, info)?;
     let model = info.model.clone();
-    if model != *source.model_id() {
-        tracing::warn!(map = %info.name, map_model = %model, server_model = %source.model_id(),
-            "this map was built with another model: it can be read and deleted, but not searched");
-        entry.put(LiveMap::new(model, MapIndex::default(), info.calibration.clone()));
+    if let Projection::Foreign | Projection::Lost = projection {
+        entry.put(LiveMap::new(model, projection, MapIndex::default(), info.calibration.clone()));
         return Ok(());
     }
     let mut entries = Vec::with_capacity(info.references as usize);
     store.scan_globals(&info.name, &mut |row| {
-        entries.push(IndexEntry {
-            id: row.reference,
-            global: row.global,
-            location: row.location,
-            captured_at: row.captured_at,
-        });
+        entries.push(index_entry(row));
         if (entries.len() as u64).is_multiple_of(PROGRESS_STEP) {
             health.indexed(PROGRESS_STEP);
         }
     })?;
     health.indexed(entries.len() as u64 % PROGRESS_STEP);
     tracing::info!(map = %info.name, references = entries.len(), "indexed");
-    entry.put(LiveMap::new(model, MapIndex::build(entries), info.calibration.clone()));
+    entry.put(LiveMap::new(model, projection, MapIndex::build(entries), info.calibration.clone()));
     Ok(())
+}
+
+pub(super) fn index_entry(row: GlobalRow) -> IndexEntry {
+    let GlobalRow { reference, global, location, captured_at } = row;
+    IndexEntry { id: reference, global, location, captured_at }
+}
+
+/// How this server makes descriptors that compare with the map's.
+fn projection(
+    store: &dyn PlaceStore,
+    source: &dyn DescriptorSource,
+    info: &MapInfo,
+) -> Result<Projection, PipelineError> {
+    let server = source.model_id();
+    match store.head(&info.name) {
+        Ok(Some(file)) => match Head::from_bytes(&file, Path::new("the map's head")) {
+            Ok(head) if head.rebind(server).is_ok_and(|model| model == info.model) => {
+                return Ok(Projection::Own(Arc::new(head)));
+            }
+            Ok(_) => {}
+            Err(error) => tracing::error!(map = %info.name, %error, "the map's head cannot be read by this release"),
+        },
+        Ok(None) => {}
+        Err(error @ StoreError::CorruptHead { .. }) if info.model != *server => {
+            tracing::error!(map = %info.name, %error, "this map is not searched");
+            return Ok(Projection::Lost);
+        }
+        // It is the server's own as well, so nothing is lost.
+        Err(error @ StoreError::CorruptHead { .. }) => tracing::error!(map = %info.name, %error),
+        Err(error) => return Err(error.into()),
+    }
+    if info.model == *server {
+        return Ok(Projection::Server);
+    }
+    tracing::warn!(map = %info.name, map_model = %info.model, server_model = %server,
+        "this map was built with another model: it can be read and deleted, but not searched; \
+         if only the head differs, `placeformer map rehead` gives it this server's");
+    Ok(Projection::Foreign)
 }

@@ -9,9 +9,12 @@ const BUILT_IN: [&str; 1] = [include_str!("../../models/dinov2-vits14-b8.calibra
 
 /// The calibration built in for `model`, if there is one.
 pub fn built_in_calibration(model: &ModelId) -> Option<Calibration> {
+    shipped().find(|calibration| calibration.model() == model)
+}
+
+fn shipped() -> impl Iterator<Item = Calibration> {
     // A test reads every one of them, so none is left out here.
-    let mut known = BUILT_IN.iter().filter_map(|text| serde_json::from_str::<Calibration>(text).ok());
-    known.find(|calibration| calibration.model() == model)
+    BUILT_IN.iter().filter_map(|text| serde_json::from_str(text).ok())
 }
 
 /// What can be said about the best answer.
@@ -25,33 +28,39 @@ pub struct Verdict {
 
 /// What this server can say about answers in general.
 pub(super) struct Trust {
-    built_in: Option<Calibration>,
+    built_in: Vec<Calibration>,
     rerank: RerankId,
 }
 
 impl Trust {
-    /// For a server that runs `model` and re-ranks as `rerank` says.
-    pub(super) fn new(model: &ModelId, rerank: RerankId) -> Self {
-        Self { built_in: built_in_calibration(model), rerank }
+    /// For a server that re-ranks as `rerank` says.
+    pub(super) fn new(rerank: RerankId) -> Self {
+        Self { built_in: shipped().collect(), rerank }
     }
 
-    /// The model's own calibration.
-    pub(super) fn built_in(&self) -> Option<&Calibration> {
-        self.built_in.as_ref()
+    /// The calibration of `model` itself.
+    pub(super) fn built_in(&self, model: &ModelId) -> Option<&Calibration> {
+        self.built_in.iter().find(|calibration| calibration.model() == model)
     }
 
-    /// Judges the best answer. Where there is none, certainly none is right.
-    pub(super) fn judge(&self, own: Option<&Calibration>, best: Option<&QueryResult>) -> Verdict {
+    /// Judges the best answer from a map of `model` with a calibration of its `own`. Where there is no answer,
+    /// certainly none is right.
+    pub(super) fn judge(&self, model: &ModelId, own: Option<&Calibration>, best: Option<&QueryResult>) -> Verdict {
         let Some(best) = best else { return Verdict { matched: Some(false), confidence: Some(0.0) } };
         let spatial_score = best.score.as_ref().map(|score| f64::from(score.spatial_score));
-        let Some(curve) = self.curve(own, spatial_score.is_some()) else { return Verdict::default() };
+        let Some(curve) = self.curve(model, own, spatial_score.is_some()) else { return Verdict::default() };
         let confidence = curve.weights.confidence(spatial_score, f64::from(best.global_distance));
         Verdict { matched: Some(curve.trusts(confidence)), confidence: Some(confidence) }
     }
 
     /// The curve in force. Scores of another re-ranking mean something else; distances do not depend on it.
-    fn curve<'a>(&'a self, own: Option<&'a Calibration>, reranked: bool) -> Option<&'a ConfidenceCurve> {
-        let known = own.into_iter().chain(&self.built_in);
+    fn curve<'a>(
+        &'a self,
+        model: &ModelId,
+        own: Option<&'a Calibration>,
+        reranked: bool,
+    ) -> Option<&'a ConfidenceCurve> {
+        let known = own.into_iter().chain(self.built_in(model));
         let mut holding = known.filter(|calibration| !reranked || *calibration.rerank() == self.rerank);
         holding.next().map(|calibration| calibration.curve(reranked))
     }
@@ -135,25 +144,29 @@ mod tests {
 
     #[test]
     fn the_maps_own_calibration_comes_first_and_only_where_it_holds() {
-        let trust = Trust { built_in: Some(calibration("r", -3.0)), rerank: RerankId::new("r") };
+        let (trust, model) =
+            (Trust { built_in: vec![calibration("r", -3.0)], rerank: RerankId::new("r") }, &ModelId::new("m"));
         let (sure, unsure) = (result(Some(1000), 0.2), result(Some(3), 1.2));
-        let of_model = trust.judge(None, Some(&sure));
+        let of_model = trust.judge(model, None, Some(&sure));
         assert_eq!(of_model.matched, Some(true));
-        assert_eq!(trust.judge(None, Some(&unsure)).matched, Some(false));
-        let own = trust.judge(Some(&calibration("r", -9.0)), Some(&sure));
+        assert_eq!(trust.judge(model, None, Some(&unsure)).matched, Some(false));
+        let own = trust.judge(model, Some(&calibration("r", -9.0)), Some(&sure));
         assert!(own.confidence < of_model.confidence && own.matched == Some(false), "{own:?}");
         // Fitted for another re-ranking: its distances still hold, its scores do not.
         let foreign = calibration("other", -9.0);
-        assert_eq!(trust.judge(Some(&foreign), Some(&sure)), of_model);
-        let global = trust.judge(Some(&foreign), Some(&result(None, 0.2)));
+        assert_eq!(trust.judge(model, Some(&foreign), Some(&sure)), of_model);
+        let global = trust.judge(model, Some(&foreign), Some(&result(None, 0.2)));
         assert!((global.confidence.unwrap() - 1.0 / (1.0 + 9.2f64.exp())).abs() < 1e-6, "{global:?}");
+        // A map with a head of its own has another model, whose distances the built-in one knows nothing of.
+        assert_eq!(trust.judge(&ModelId::new("other head"), None, Some(&sure)), Verdict::default());
     }
 
     #[test]
     fn without_a_calibration_nothing_is_guessed_but_nothing_is_no_match() {
-        let trust = Trust { built_in: None, rerank: RerankId::new("r") };
-        assert_eq!(trust.judge(None, Some(&result(Some(1000), 0.1))), Verdict::default());
-        assert_eq!(trust.judge(None, None), Verdict { matched: Some(false), confidence: Some(0.0) });
+        let model = &ModelId::new("m");
+        let trust = Trust { built_in: Vec::new(), rerank: RerankId::new("r") };
+        assert_eq!(trust.judge(model, None, Some(&result(Some(1000), 0.1))), Verdict::default());
+        assert_eq!(trust.judge(model, None, None), Verdict { matched: Some(false), confidence: Some(0.0) });
         let refused = trust.check(&"m".parse().unwrap(), &calibration("other", 0.0)).unwrap_err().to_string();
         assert!(refused.contains("\"r\"") && refused.contains("\"other\""), "{refused}");
     }

@@ -67,6 +67,12 @@ pub enum StoreError {
         /// Its name as far as it can be read.
         map: String,
     },
+    /// The head that a map keeps for itself fails its checksum.
+    #[error("the head that map {map} keeps is damaged on disk; give it a head again, its references are whole")]
+    CorruptHead {
+        /// The map.
+        map: MapName,
+    },
     /// The descriptor offered breaks a rule of its type: a fault of the caller.
     #[error("the descriptor cannot be stored: {reason}")]
     InvalidDescriptor {
@@ -148,7 +154,7 @@ impl StoreError {
             Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
             Self::ModelMismatch { .. } => ErrorCode::ModelMismatch,
             Self::CalibrationMismatch { .. } => ErrorCode::CalibrationMismatch,
-            Self::Corrupt { .. } | Self::CorruptMap { .. } => ErrorCode::CorruptRecord,
+            Self::Corrupt { .. } | Self::CorruptMap { .. } | Self::CorruptHead { .. } => ErrorCode::CorruptRecord,
             Self::DiskFull => ErrorCode::DiskFull,
             Self::Busy { .. } | Self::ReheadInProgress { .. } => ErrorCode::Overloaded,
             Self::Closing => ErrorCode::ShuttingDown,

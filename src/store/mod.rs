@@ -132,6 +132,35 @@ pub struct Quarantined {
     pub reason: String,
 }
 
+/// The head that a map is given.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NewHead {
+    /// The map's model from then on.
+    pub model: ModelId,
+    /// The head's file, to be kept with the map; none for a map that goes with the server's own head.
+    pub file: Option<Vec<u8>>,
+}
+
+/// The caller's part in [`PlaceStore::replace_globals`]. A closure that makes one global vector of one pooled vector
+/// is one.
+pub trait HeadExchange {
+    /// The new global vectors of pooled ones (`[dim]` each, unit length to half precision), in their order. The
+    /// caller answers for their fitting the new head.
+    fn project(&mut self, pooled: &[Vec<f32>]) -> Vec<Vec<f32>>;
+    /// Told of every reference that can be served, once its new vector is durable.
+    fn converted(&mut self, _row: GlobalRow) {}
+    /// All references there are have new vectors. When this returns, those added meanwhile get theirs and the map
+    /// changes over; a caller that keeps an index lets no one insert or change from here on until it has changed over,
+    /// too.
+    fn finishing(&mut self) {}
+}
+
+impl<F: FnMut(&[f32]) -> Vec<f32>> HeadExchange for F {
+    fn project(&mut self, pooled: &[Vec<f32>]) -> Vec<Vec<f32>> {
+        pooled.iter().map(|pooled| self(pooled)).collect()
+    }
+}
+
 /// A durable set of maps. All calls block; callers keep them off the async threads.
 ///
 /// A write returns only after it is fsynced; a reader sees a reference whole or not at all.
@@ -169,15 +198,11 @@ pub trait PlaceStore: Send + Sync {
     fn patches(&self, id: ReferenceId) -> Result<PackedPatches, StoreError>;
     /// Every global descriptor of a map, to rebuild its index.
     fn scan_globals(&self, map: &MapName, visit: &mut dyn FnMut(GlobalRow)) -> Result<(), StoreError>;
-    /// Gives a map another head: `compute` makes the new global vector from each pooled vector (`[dim]`, unit length
-    /// to half precision; the caller answers for its fitting the new head). Atomic: all references change to `new_model` or none. Reads and writes go on meanwhile;
-    /// the map's calibration is cleared. An index of the map must be rebuilt afterwards.
-    fn replace_globals(
-        &self,
-        map: &MapName,
-        new_model: ModelId,
-        compute: &mut dyn FnMut(&[f32]) -> Vec<f32>,
-    ) -> Result<(), StoreError>;
+    /// Gives a map another head: `exchange` makes the new global vectors of the pooled ones. Atomic: all references
+    /// change to the new model or none. Reads and writes go on meanwhile; the map's calibration is cleared.
+    fn replace_globals(&self, map: &MapName, head: NewHead, exchange: &mut dyn HeadExchange) -> Result<(), StoreError>;
+    /// The file of the head that the map keeps for itself, as it was given; none if it goes with the server's own.
+    fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError>;
     /// Stores the map's calibration, which must have been fitted for its model, or clears it.
     fn set_calibration(&self, map: &MapName, calibration: Option<Calibration>) -> Result<(), StoreError>;
     /// References known to be damaged. They are not served; deleting them or sending their image again ends it.

@@ -12,4 +12,5 @@ mod disk;
 mod errors;
 mod killed;
 mod process;
+mod rehead;
 mod surface;

@@ -1,8 +1,9 @@
 //! The real server in a process of its own: this test binary, started again on one test that serves.
 
-use crate::support::FakeSource;
+use crate::support::{BACKBONE, FakeSource, head};
 use placeformer::cli::serve::{Loaders, run_server};
 use placeformer::config::Config;
+use placeformer::extract::Aggregate;
 use placeformer::store::{SqliteStore, StoreConfig, crash_points};
 use serde_json::Value;
 use std::io::{BufRead, BufReader, Write};
@@ -27,7 +28,7 @@ fn child_that_serves_until_it_is_killed() {
     config.pipeline.disk_reserve_bytes = 0;
     let (data, store) = (config.data.directory.clone(), config.store.clone());
     let loaders = Loaders {
-        source: Box::new(|| Ok(FakeSource::new("fake-1"))),
+        source: Box::new(|| Ok(FakeSource::with_head(head(1, BACKBONE, Aggregate::Mean)))),
         store: Box::new(move || Ok(Arc::new(SqliteStore::open(&data, &store)?))),
     };
     tokio::runtime::Runtime::new().unwrap().block_on(async {
@@ -83,6 +84,12 @@ impl Server {
     pub fn post(&self, path: &str, body: Vec<u8>) -> Option<(u16, Value)> {
         let url = format!("{}{path}", self.url);
         read(self.http.post(url).header("content-type", "image/png").body(body).send())
+    }
+
+    /// As [`Server::get`], with a file.
+    pub fn put(&self, path: &str, body: Vec<u8>) -> Option<(u16, Value)> {
+        let url = format!("{}{path}", self.url);
+        read(self.http.put(url).header("content-type", "application/octet-stream").body(body).send())
     }
 
     /// As [`Server::get`].

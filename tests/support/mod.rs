@@ -7,7 +7,7 @@ use axum::http::{HeaderMap, Request, StatusCode};
 use axum::response::Response;
 use http_body_util::BodyExt;
 use placeformer::config::Config;
-use placeformer::extract::ExtractError;
+use placeformer::extract::{Aggregate, ExtractError, Head};
 use placeformer::http::{AppState, app};
 use placeformer::ops::{Health, Metrics};
 use placeformer::pipeline::{DescriptorSource, Parts, Service};
@@ -32,6 +32,7 @@ pub const SIZE: ImageSize = ImageSize { width: 112, height: 84 };
 /// Descriptors from content alone: equal images are equal, different ones as unrelated as random vectors.
 pub struct FakeSource {
     model: ModelId,
+    head: Option<Head>,
     /// Images described so far.
     pub described: AtomicUsize,
     delay: Mutex<Duration>,
@@ -39,7 +40,17 @@ pub struct FakeSource {
 
 impl FakeSource {
     pub fn new(model: &str) -> Arc<Self> {
-        Arc::new(Self { model: ModelId::new(model), described: AtomicUsize::new(0), delay: Mutex::default() })
+        Self::made(ModelId::new(model), None)
+    }
+
+    /// One whose global descriptors are its pooled tokens behind `head`.
+    pub fn with_head(head: Head) -> Arc<Self> {
+        let headless = ModelId::new(format!("{BACKBONE}:{SIZE}:t1:k48-12-4:hnone"));
+        Self::made(head.rebind(&headless).unwrap(), Some(head))
+    }
+
+    fn made(model: ModelId, head: Option<Head>) -> Arc<Self> {
+        Arc::new(Self { model, head, described: AtomicUsize::new(0), delay: Mutex::default() })
     }
 
     /// Lets every further description take this long.
@@ -57,6 +68,10 @@ impl DescriptorSource for FakeSource {
         &self.model
     }
 
+    fn head(&self) -> Option<&Head> {
+        self.head.as_ref()
+    }
+
     fn input_size(&self) -> ImageSize {
         SIZE
     }
@@ -65,12 +80,33 @@ impl DescriptorSource for FakeSource {
         self.described.fetch_add(images.len(), Ordering::SeqCst);
         let delay = *self.delay.lock().unwrap();
         std::thread::sleep(delay);
-        Ok(images.iter().map(describe).collect())
+        let mut descriptors: Vec<Descriptor> = images.iter().map(describe).collect();
+        if let Some(head) = &self.head {
+            descriptors.iter_mut().for_each(|descriptor| descriptor.global = head.project(&descriptor.pooled));
+        }
+        Ok(descriptors)
     }
 
     fn memory_bytes(&self) -> u64 {
         0
     }
+}
+
+/// Whose tokens the fake ones pretend to be.
+pub const BACKBONE: &str = "fake:0123456789ab:b8";
+
+/// A head for `backbone`, drawn from `seed`.
+pub fn head(seed: u64, backbone: &str, aggregate: Aggregate) -> Head {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let weight = (0..GLOBAL_DIM * 384).map(|_| rng.random_range(-1.0..1.0)).collect();
+    Head::new(aggregate, weight, vec![0.0; GLOBAL_DIM], backbone, [].into()).unwrap()
+}
+
+/// The bytes of its file.
+pub fn file_of(head: &Head) -> Vec<u8> {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    head.save(file.path()).unwrap();
+    std::fs::read(file.path()).unwrap()
 }
 
 fn describe(image: &ImageTensor) -> Descriptor {
@@ -138,6 +174,10 @@ impl App {
 
     pub async fn post_png(&self, path: &str, seed: u64) -> Answer {
         self.post(path, "image/png", picture(seed)).await
+    }
+
+    pub async fn put(&self, path: &str, kind: &str, body: impl Into<Body>) -> Answer {
+        self.send(Request::put(path).header("content-type", kind).body(body.into()).unwrap()).await
     }
 
     pub async fn patch(&self, path: &str, body: &Value) -> Answer {

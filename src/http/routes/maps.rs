@@ -2,7 +2,7 @@
 
 use crate::error::ErrorCode;
 use crate::http::AppState;
-use crate::http::body::read_json;
+use crate::http::body::{read_file, read_json};
 use crate::http::problem::ApiError;
 use crate::store::MapInfo;
 use crate::types::{Calibration, MapName};
@@ -12,6 +12,9 @@ use axum::http::StatusCode;
 use serde::Serialize;
 use time::OffsetDateTime;
 use utoipa::ToSchema;
+
+/// Largest head: a VLAD of 80 words of ViT-S tokens, or of 20 of ViT-L tokens.
+const MAX_HEAD_BYTES: usize = 32 << 20;
 
 /// A map.
 #[derive(Debug, Serialize, ToSchema)]
@@ -123,4 +126,41 @@ pub async fn calibrate(
 pub async fn uncalibrate(State(state): State<AppState>, Path(map): Path<String>) -> Result<StatusCode, ApiError> {
     state.service()?.set_calibration(parse_name(&map)?, None).await?;
     Ok(StatusCode::NO_CONTENT)
+}
+
+/// Give a map another head
+///
+/// The body is a head's file, as `placeformer head fit` or `head train` writes it. The global descriptors of all
+/// references are made anew from the pooled tokens that are kept, without the images; the answer comes when that is
+/// done. Queries are answered throughout, with the old head until the new one is in force; new references wait only
+/// for the moment of changing over. The map keeps its head whatever head the server runs, and loses its calibration,
+/// which holds for the old model alone.
+///
+/// A head made for another backbone or another pooling of tokens is refused with both identities (409). One head can be
+/// given at a time (503).
+#[utoipa::path(put, path = "/maps/{map}/head", tag = "maps",
+    request_body(content = String, content_type = "application/octet-stream"),
+    params(("map" = String, Path, description = "The map's name.")), responses(
+    (status = 200, description = "The map with its new model.", body = MapBody),
+))]
+pub async fn rehead(
+    State(state): State<AppState>,
+    Path(map): Path<String>,
+    request: Request,
+) -> Result<Json<MapBody>, ApiError> {
+    let (service, map) = (state.service()?, parse_name(&map)?);
+    let (file, _held) = read_file(&state, request, MAX_HEAD_BYTES).await?;
+    Ok(Json(service.set_head(map, Some(file)).await?.into()))
+}
+
+/// Give a map the server's head
+///
+/// As with `PUT`, but with the head that the server itself runs, which the map then goes along with. This is also how a
+/// map made by a server with another head is brought over to this one.
+#[utoipa::path(delete, path = "/maps/{map}/head", tag = "maps",
+    params(("map" = String, Path, description = "The map's name.")), responses(
+    (status = 200, description = "The map with the server's model.", body = MapBody),
+))]
+pub async fn unhead(State(state): State<AppState>, Path(map): Path<String>) -> Result<Json<MapBody>, ApiError> {
+    Ok(Json(state.service()?.set_head(parse_name(&map)?, None).await?.into()))
 }

@@ -23,6 +23,7 @@ pub fn all() -> OpenApiRouter<AppState> {
         .routes(routes!(maps::list))
         .routes(routes!(maps::get, maps::delete))
         .routes(routes!(maps::calibrate, maps::uncalibrate))
+        .routes(routes!(maps::rehead, maps::unhead))
         .routes(routes!(info::info))
         .routes(routes!(ops::livez))
         .routes(routes!(ops::readyz))

@@ -8,7 +8,10 @@ use crate::store::{StoreError, crash_points};
 use rusqlite::{Connection, TransactionBehavior, params};
 
 /// Every migration, oldest first; its version is its place, counting from 1.
-const MIGRATIONS: &[(&str, &str)] = &[("initial", include_str!("../../../migrations/sqlite/0001_initial.sql"))];
+const MIGRATIONS: &[(&str, &str)] = &[
+    ("initial", include_str!("../../../migrations/sqlite/0001_initial.sql")),
+    ("map_head", include_str!("../../../migrations/sqlite/0002_map_head.sql")),
+];
 
 const HISTORY: &str = "CREATE TABLE IF NOT EXISTS schema_migration (
     version    INTEGER PRIMARY KEY,

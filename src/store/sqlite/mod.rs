@@ -32,9 +32,10 @@ use self::quarantine::Quarantine;
 use self::rows::MapRow;
 use self::writer::{Effect, Pending, Writer};
 use super::{
-    GlobalRow, Inserted, MapInfo, Page, PlaceStore, Quarantined, ReferencePatch, StoreConfig, StoreError, VerifyReport,
+    GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined, ReferencePatch, StoreConfig,
+    StoreError, VerifyReport,
 };
-use crate::types::{Calibration, ExternalId, MapName, ModelId, NewReference, PackedPatches, Reference, ReferenceId};
+use crate::types::{Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId};
 use std::path::{Path, PathBuf};
 
 /// A store in one directory, shared by all threads of one process.
@@ -186,13 +187,12 @@ impl PlaceStore for SqliteStore {
         })
     }
 
-    fn replace_globals(
-        &self,
-        map: &MapName,
-        new_model: ModelId,
-        compute: &mut dyn FnMut(&[f32]) -> Vec<f32>,
-    ) -> Result<(), StoreError> {
-        self.exchange_head(map, new_model, compute)
+    fn replace_globals(&self, map: &MapName, head: NewHead, exchange: &mut dyn HeadExchange) -> Result<(), StoreError> {
+        self.exchange_head(map, head, exchange)
+    }
+
+    fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError> {
+        self.readers.with(|connection| rehead::read_head(connection, &MapRow::require(connection, map)?))
     }
 
     fn set_calibration(&self, map: &MapName, calibration: Option<Calibration>) -> Result<(), StoreError> {

@@ -64,6 +64,7 @@ fn purge_version(connection: &Connection) -> rusqlite::Result<bool> {
         params![version, BATCH_VECTORS],
     )?;
     if removed == 0 {
+        connection.execute("DELETE FROM map_head WHERE version = ?1", [version])?;
         connection.execute("DELETE FROM retired_version WHERE version = ?1", [version])?;
     }
     Ok(true)

@@ -3,30 +3,50 @@
 //! The new vectors are written beside the old as another version, batch by batch, while queries and inserts go on
 //! with the old. One last small transaction makes the map use the new version and binds it to the new model; it
 //! commits only if no reference was added since the last batch, otherwise that batch comes first. A crash before
-//! leaves the map as it was; the unfinished version is removed at the next start.
+//! leaves the map as it was; the unfinished version is removed at the next start. A head that the map is to keep is
+//! stored under the number of its version before the first vector, so that it comes and goes with them.
 
-use super::engine::failed;
+use super::engine::{damage, failed};
 use super::insert::{check_global, next_in_sequence, write_global};
-use super::rows::{self, MapRow, RowError};
+use super::rows::{self, MapRow, REFERENCE_COLUMNS, REFERENCE_SOURCE, ReferenceRow, RowError, head_checksum};
 use super::writer::Effect;
 use super::{SqliteStore, purge, read};
-use crate::store::{StoreError, codec, crash_points};
-use crate::types::{GLOBAL_DIM, MapName, ModelId};
-use rusqlite::Connection;
+use crate::store::{GlobalRow, HeadExchange, NewHead, StoreError, codec, crash_points};
+use crate::types::{GLOBAL_DIM, MapName, ModelId, ReferenceId};
+use rusqlite::{Connection, OptionalExtension, Row, params};
+use std::sync::Arc;
 
 /// References converted per transaction.
 const BATCH: i64 = 512;
+
+/// A reference whose vector is to be made anew.
+struct Source {
+    number: i64,
+    pooled: Vec<f32>,
+    /// What an index needs of it, its vector still missing; absent while it is not served.
+    row: Option<GlobalRow>,
+}
+
+/// References read together; the damaged ones among them are quarantined and left without a vector.
+struct Batch {
+    sources: Vec<Source>,
+    /// The greatest number read; absent if there was nothing left to read.
+    newest: Option<i64>,
+}
 
 impl SqliteStore {
     pub(super) fn exchange_head(
         &self,
         map: &MapName,
-        new_model: ModelId,
-        compute: &mut dyn FnMut(&[f32]) -> Vec<f32>,
+        head: NewHead,
+        exchange: &mut dyn HeadExchange,
     ) -> Result<(), StoreError> {
-        let name = map.clone();
-        let (number, version) = self.writer.run(Effect::Grows(0), move |connection| begin(connection, &name))?;
-        let exchanged = self.convert(map, number, version, &new_model, compute);
+        let (name, model, file) = (map.clone(), head.model, head.file.map(Arc::new));
+        let bytes = file.as_ref().map_or(0, |file| file.len());
+        let (begun, bound) = (name.clone(), model.clone());
+        let begin = move |connection: &Connection| begin(connection, &begun, &bound, file.as_deref());
+        let (number, version) = self.writer.run(Effect::Grows(bytes), begin)?;
+        let exchanged = self.convert(&name, number, version, &model, exchange);
         if exchanged.is_err() {
             // Whatever went wrong is what the caller hears; the next start cleans up if this fails as well.
             let _ = self.writer.run(Effect::Shrinks, move |connection| abandon(connection, number, version));
@@ -39,14 +59,20 @@ impl SqliteStore {
         map: &MapName,
         number: i64,
         version: i64,
-        new_model: &ModelId,
-        compute: &mut dyn FnMut(&[f32]) -> Vec<f32>,
+        model: &ModelId,
+        exchange: &mut dyn HeadExchange,
     ) -> Result<(), StoreError> {
-        let mut last = 0;
+        let (mut last, mut finishing) = (0, false);
         loop {
-            let batch = self.readers.with(|connection| self.pooled_behind(connection, number, last))?;
-            let Some(&(newest, _)) = batch.last() else {
-                let (name, model) = (map.clone(), new_model.clone());
+            let Batch { sources, newest } =
+                self.readers.with(|connection| self.pooled_behind(connection, number, last))?;
+            let Some(newest) = newest else {
+                if !finishing {
+                    exchange.finishing();
+                    finishing = true;
+                    continue;
+                }
+                let (name, model) = (map.clone(), model.clone());
                 let finish = move |connection: &Connection| finish(connection, &name, &model, version, last);
                 // Freeing the old version follows, so finishing may use the reserve.
                 if self.writer.run(Effect::Shrinks, finish)? {
@@ -55,45 +81,57 @@ impl SqliteStore {
                 continue;
             };
             last = newest;
-            let mut vectors = Vec::with_capacity(batch.len());
-            for (number, pooled) in batch {
-                let Some(pooled) = pooled else { continue };
-                let global = compute(&pooled);
-                check_global(&global)?;
-                vectors.push((number, codec::encode_f32(&global)));
-            }
-            let (name, bytes) = (map.clone(), vectors.len() * GLOBAL_DIM * 4);
-            let write = move |connection: &Connection| write_batch(connection, &name, version, &vectors);
-            self.writer.run(Effect::Grows(bytes), write)?;
+            self.convert_batch(map, version, sources, exchange)?;
             crash_points::reach(crash_points::MID_REHEAD);
         }
     }
 
-    /// The next pooled vectors by number; `None` for damaged ones, which are quarantined and left without a vector.
-    #[allow(clippy::type_complexity)]
-    fn pooled_behind(
+    fn convert_batch(
         &self,
-        connection: &Connection,
-        map: i64,
-        last: i64,
-    ) -> Result<Vec<(i64, Option<Vec<f32>>)>, StoreError> {
+        map: &MapName,
+        version: i64,
+        mut sources: Vec<Source>,
+        exchange: &mut dyn HeadExchange,
+    ) -> Result<(), StoreError> {
+        let pooled: Vec<_> = sources.iter_mut().map(|source| std::mem::take(&mut source.pooled)).collect();
+        let globals = exchange.project(&pooled);
+        if globals.len() != sources.len() {
+            let reason = format!("{} pooled vectors became {} global vectors", sources.len(), globals.len());
+            return Err(StoreError::InvalidDescriptor { reason });
+        }
+        globals.iter().try_for_each(|global| check_global(global))?;
+        let encoded: Vec<_> =
+            sources.iter().zip(&globals).map(|(s, global)| (s.number, codec::encode_f32(global))).collect();
+        let (name, bytes) = (map.clone(), encoded.len() * GLOBAL_DIM * 4);
+        let write = move |connection: &Connection| write_batch(connection, &name, version, &encoded);
+        self.writer.run(Effect::Grows(bytes), write)?;
+        for (source, global) in sources.into_iter().zip(globals) {
+            if let Some(row) = source.row {
+                exchange.converted(GlobalRow { global, ..row });
+            }
+        }
+        Ok(())
+    }
+
+    /// The next references by number with their pooled vectors.
+    fn pooled_behind(&self, connection: &Connection, map: i64, last: i64) -> Result<Batch, StoreError> {
         let reading = failed("reading pooled vectors");
-        let sql = "SELECT r.number, p.vector, p.checksum FROM reference r
-                   LEFT JOIN pooled_vector p ON p.number = r.number
-                   WHERE r.map = ?1 AND r.number > ?2 ORDER BY r.number LIMIT ?3";
-        let mut statement = connection.prepare_cached(sql).map_err(&reading)?;
+        let sql = format!(
+            "SELECT {REFERENCE_COLUMNS}, p.vector, p.checksum FROM {REFERENCE_SOURCE}
+             LEFT JOIN pooled_vector p ON p.number = r.number
+             WHERE r.map = ?1 AND r.number > ?2 ORDER BY r.number LIMIT ?3"
+        );
+        let mut statement = connection.prepare_cached(&sql).map_err(&reading)?;
         let mut found = statement.query([map, last, BATCH]).map_err(&reading)?;
-        let mut batch = Vec::new();
+        let mut batch = Batch { sources: Vec::new(), newest: None };
         while let Some(row) = found.next().map_err(&reading)? {
             let number: i64 = row.get(0).map_err(&reading)?;
-            let pooled = read::blob(row, 1)
-                .and_then(|vector| Ok((vector, row.get(2)?)))
-                .and_then(|(vector, checksum)| rows::read_pooled(number, vector, checksum));
-            match pooled {
-                Ok(pooled) => batch.push((number, Some(pooled))),
+            batch.newest = Some(number);
+            match source(row, number) {
+                Ok(source) if self.quarantine.contains(number) => batch.sources.push(Source { row: None, ..source }),
+                Ok(source) => batch.sources.push(source),
                 Err(RowError::Damaged(reason)) => {
                     self.put_in_quarantine(number, map, self.id_of(connection, number), &reason);
-                    batch.push((number, None));
                 }
                 Err(RowError::Engine(error)) => return Err(reading(error)),
             }
@@ -102,15 +140,53 @@ impl SqliteStore {
     }
 }
 
-/// Reserves a version for the new vectors.
-fn begin(connection: &Connection, name: &MapName) -> Result<(i64, i64), StoreError> {
+fn source(row: &Row<'_>, number: i64) -> Result<Source, RowError> {
+    let pooled = rows::read_pooled(number, read::blob(row, 14)?, row.get(15)?)?;
+    let columns = ReferenceRow::read(row)?;
+    let (location, captured_at) = columns.place_and_time()?;
+    let reference: ReferenceId = columns.id();
+    Ok(Source { number, pooled, row: Some(GlobalRow { reference, global: Vec::new(), location, captured_at }) })
+}
+
+/// The file of the head that a map keeps for itself.
+pub(super) fn read_head(connection: &Connection, map: &MapRow) -> Result<Option<Vec<u8>>, StoreError> {
+    let damaged = || StoreError::CorruptHead { map: map.name.clone() };
+    let stored = connection
+        .prepare_cached("SELECT file, checksum FROM map_head WHERE version = ?1")
+        .and_then(|mut statement| {
+            statement.query_row([map.version], |row| Ok((row.get::<_, Vec<u8>>(0)?, row.get::<_, i64>(1)?))).optional()
+        })
+        .map_err(|error| if damage(&error).is_some() { damaged() } else { failed("reading a map's head")(error) })?;
+    match stored {
+        Some((file, checksum)) if checksum == head_checksum(map.version, &map.model, &file) => Ok(Some(file)),
+        Some(_) => Err(damaged()),
+        None => Ok(None),
+    }
+}
+
+/// Reserves a version for the new vectors, and stores the head that makes them if the map is to keep it.
+fn begin(
+    connection: &Connection,
+    name: &MapName,
+    model: &ModelId,
+    file: Option<&Vec<u8>>,
+) -> Result<(i64, i64), StoreError> {
+    let beginning = failed("beginning another head");
     let mut map = MapRow::require(connection, name)?;
     if map.pending_version.is_some() {
         return Err(StoreError::ReheadInProgress { map: name.clone() });
     }
-    let version = next_in_sequence(connection, "version").map_err(failed("beginning another head"))?;
+    let version = next_in_sequence(connection, "version").map_err(&beginning)?;
     map.pending_version = Some(version);
     map.save(connection)?;
+    if let Some(file) = file {
+        connection
+            .execute(
+                "INSERT INTO map_head (version, file, checksum) VALUES (?1, ?2, ?3)",
+                params![version, file, head_checksum(version, model, file)],
+            )
+            .map_err(&beginning)?;
+    }
     Ok((map.number, version))
 }
 

@@ -345,6 +345,11 @@ pub(super) fn read_global(version: i64, number: i64, vector: &[u8], checksum: i6
     codec::decode_f32(vector).ok_or_else(|| RowError::Damaged("the global vector holds no numbers".into()))
 }
 
+/// Checksum of a head that the map of `model` keeps.
+pub(super) fn head_checksum(version: i64, model: &ModelId, file: &[u8]) -> i64 {
+    Checksum::of("map_head").integer(version).bytes(model.as_str().as_bytes()).bytes(file).finish()
+}
+
 /// Checksum of a pooled vector's row.
 pub(super) fn pooled_checksum(number: i64, vector: &[u8]) -> i64 {
     Checksum::of("pooled_vector").integer(number).bytes(vector).finish()

@@ -2,7 +2,7 @@
 
 use super::engine::{damage, failed};
 use super::rows::{self, MapRow, REFERENCE_COLUMNS, REFERENCE_SOURCE, ReferenceRow, RowError};
-use super::{SqliteStore, read};
+use super::{SqliteStore, read, rehead};
 use crate::store::{StoreError, VerifyReport};
 use crate::types::ReferenceId;
 use rusqlite::{Connection, OptionalExtension};
@@ -16,6 +16,10 @@ impl SqliteStore {
         let (maps, damaged_maps) = MapRow::all(connection)?;
         report.engine_errors.extend(damaged_maps.iter().map(|name| format!("the record of map {name} is damaged")));
         for map in &maps {
+            match rehead::read_head(connection, map) {
+                Err(error @ StoreError::CorruptHead { .. }) => report.engine_errors.push(error.to_string()),
+                outcome => outcome.map(drop)?,
+            }
             match self.verify_map(connection, map, &mut report) {
                 // Where the engine itself gives up on a map, the others are still worth checking.
                 Err(error @ StoreError::Engine { .. }) => {
