@@ -2,7 +2,7 @@
 
 use super::IndexEntry;
 use super::filter::{Extent, PlaceAndTime};
-use crate::kernels::scan::{Codes, LENGTH};
+use crate::kernels::scan::{Codes, LENGTH, Rows};
 use crate::types::{GLOBAL_DIM, ReferenceId};
 
 const _: () = assert!(LENGTH == GLOBAL_DIM);
@@ -71,6 +71,12 @@ impl Block {
 
     pub(super) fn len(&self) -> usize {
         self.ids.len()
+    }
+
+    /// What a scan reads.
+    pub(super) fn rows(&self) -> Rows<'_> {
+        let Self { codes, scales, errors, squares, longest, .. } = self;
+        Rows { codes, scales, errors, squares, longest: *longest }
     }
 
     /// Appends one reference.
