@@ -129,7 +129,7 @@ pub fn next_near(
 
 /// The definition.
 fn next_near_scalar(probe: &Probe, rows: &Rows<'_>, from: usize, threshold: f32, found: &mut Bounds) -> Option<usize> {
-    (from..).step_by(GROUP).take_while(|start| start + GROUP <= rows.codes.len()).find(|&start| {
+    (from..rows.codes.len()).step_by(GROUP).take_while(|start| rows.codes.len() - start >= GROUP).find(|&start| {
         let mut dots = [0; GROUP];
         scalar(&probe.codes, &rows.codes[start..start + GROUP], &mut dots);
         is_near(probe, rows, start, &dots, threshold, found)
