@@ -2,11 +2,12 @@
 //!
 //! | module | holds |
 //! |---|---|
-//! | [`scan`] | dot products of one int8 vector with many, for the search |
+//! | [`scan`] | one int8 vector against many: bounds on their distances, for the search |
 //! | [`simd`] | which instructions may be used: chosen once at start, or forced by `PLACEFORMER_SIMD` |
 //! | [`homography`] | four-point homographies and inlier counts, in vectors |
 //! | [`similarity`] | best partners among int8 descriptors: running row and column maxima |
 //! | [`gemm`], [`elementwise`], [`attention`] | the transformer: packed products, what lies between them, blocked softmax attention |
+//! | [`quantise`] | f32 vectors to int8 codes |
 //! | [`peak`] | what the machine can do at most, for benchmarks |
 //! | [`operand`], `dot` | the formats of a product: f32, bf16, int8 |
 //! | `lanes`, [`aligned`] | a vector register by level; buffers on cache lines |
@@ -25,6 +26,8 @@ pub mod homography;
 mod lanes;
 pub mod operand;
 pub mod peak;
+#[allow(clippy::needless_range_loop, reason = "lanes index several arrays at once")]
+pub mod quantise;
 pub mod scan;
 pub mod simd;
 #[allow(clippy::needless_range_loop, reason = "sections and halves index several arrays at once")]
@@ -42,6 +45,7 @@ type Check = fn(Simd) -> Result<(), String>;
 const CHECKS: &[(&str, Check)] = &[
     ("homography", homography::check),
     ("scan", scan::check),
+    ("quantise", quantise::check),
     ("similarity", similarity::check),
     ("gemm", gemm::check),
     ("elementwise", elementwise::check),

@@ -18,7 +18,7 @@ pub const SIMD_VARIABLE: &str = "PLACEFORMER_SIMD";
 pub enum SimdLevel {
     /// Portable Rust; the reference every other level is compared with.
     Scalar,
-    /// AVX2, FMA and F16C.
+    /// AVX2, FMA, F16C and POPCNT.
     Avx2,
     /// AVX-512 F, BW, DQ, VL and VNNI on top of [`SimdLevel::Avx2`].
     Avx512,
@@ -39,8 +39,12 @@ impl SimdLevel {
 
     #[cfg(target_arch = "x86_64")]
     fn is_available(self) -> bool {
-        let avx2 =
-            || is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") && is_x86_feature_detected!("f16c");
+        let avx2 = || {
+            is_x86_feature_detected!("avx2")
+                && is_x86_feature_detected!("fma")
+                && is_x86_feature_detected!("f16c")
+                && is_x86_feature_detected!("popcnt")
+        };
         let avx512 = || {
             is_x86_feature_detected!("avx512f")
                 && is_x86_feature_detected!("avx512bw")

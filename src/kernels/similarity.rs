@@ -14,6 +14,8 @@
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "x86_64")]
+mod driver;
 
 use super::simd::{Simd, SimdLevel};
 
@@ -54,7 +56,10 @@ impl Quantised<'_> {
     /// Where the parts contradict each other: the kernels index by them without further checks.
     fn validate(&self) {
         assert!((1..=MAX_DIM).contains(&self.dim), "descriptors of {} values cannot be compared", self.dim);
-        assert_eq!(self.codes.len(), self.len() * self.dim, "codes do not fill the descriptors announced");
+        // Added up without wrapping, since the counts decide what is read.
+        let total = self.counts.iter().try_fold(0usize, |total, &count| total.checked_add(count));
+        let values = total.and_then(|total| total.checked_mul(self.dim));
+        assert_eq!(values, Some(self.codes.len()), "codes do not fill the descriptors announced");
         assert_eq!(self.factors.len(), self.len(), "every descriptor needs one factor");
     }
 
@@ -432,6 +437,14 @@ mod tests {
             block_maxima(&packed, rows.quantised(7), &wanted, &mut scratch, &mut out);
             assert_eq!(out, maxima_at(Simd::SCALAR, small.quantised(7), rows.quantised(7), &wanted));
         }
+    }
+
+    #[test]
+    #[should_panic(expected = "do not fill")]
+    fn counts_that_wrap_around_are_refused() {
+        let half = usize::MAX / 2 + 1;
+        let wrapping = Quantised { dim: 2, counts: [half, half, 0], codes: &[], factors: &[] };
+        PackedColumns::new(Simd::best()).pack(wrapping);
     }
 
     #[test]

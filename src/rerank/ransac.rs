@@ -1,16 +1,16 @@
 //! The homography most correspondences agree with (paper III-D, step 7): RANSAC with local optimisation.
 //!
-//! Samples of four are drawn, solved and screened eight at a time; each surviving homography is scored on all
-//! correspondences. Whenever one beats the best so far, least squares on the correspondences near it tries to gain
-//! more. The search stops once a sample free of outliers, had the best share of inliers been the true one, would have
-//! been drawn with the confidence asked for.
+//! Samples of four are drawn and screened many at a time; those that could be corners of one plane are gathered, solved
+//! and scored on all correspondences. Whenever one beats the best so far, least squares on the correspondences near it
+//! tries to gain more. The search stops once a sample free of outliers, had the best share of inliers been the true
+//! one, would have been drawn with the confidence asked for.
 //!
 //! Correspondences are sorted and the generator is seeded from their coordinates, so a pair's outcome depends on its
 //! content alone: not on time, threads, machine, or the order of the correspondences.
 
 use super::refine::refit;
 use crate::kernels::Simd;
-use crate::kernels::homography::{self, LANES, PointPairs, Samples};
+use crate::kernels::homography::{self, Hypotheses, LANES, PointPairs, Sample, Sampler};
 
 /// A sample's triangles must be larger than this, in squared tolerances (twice the area). On a grid of patches 2/3 of
 /// the tolerance apart the smallest proper triangle has 0.11 (half-patch offsets) to 0.44.
@@ -19,6 +19,13 @@ const MIN_AREA: f32 = 0.05;
 /// Samples drawn for every homography that may be scored: among false matches about one sample in eight keeps its
 /// orientation.
 const DRAWS_PER_HOMOGRAPHY: usize = 8;
+
+/// Samples drawn and screened at once.
+const CHUNK: usize = 4 * LANES;
+
+/// Whether to go on is asked before every so many samples. Scores depend on it, and on it alone: not on how many are
+/// drawn or solved at once.
+const ROUND: usize = 8;
 
 /// Settings of the search.
 #[derive(Debug, Clone, Copy)]
@@ -61,7 +68,7 @@ impl Ransac {
         if self.sorted.len() < 4 {
             return None;
         }
-        self.sorted.sort_unstable_by_key(|pair| pair.map(f32::to_bits));
+        self.sorted.sort_unstable_by_key(key);
         let frame = Frame::of(&self.sorted, f64::from(settings.tolerance_px));
         self.points.fill(self.sorted.iter().map(|&pair| frame.normalise(pair)));
         let mut search = Search { simd, points: &self.points, best: 0, homography: None };
@@ -71,6 +78,11 @@ impl Ransac {
         let inliers = self.sorted.iter().filter(near).count() as u32;
         Some(Estimate { homography, inliers })
     }
+}
+
+/// The bits of all coordinates in one number, so that one comparison orders two correspondences.
+fn key(pair: &[f32; 4]) -> u128 {
+    pair.iter().fold(0, |key, value| key << 32 | u128::from(value.to_bits()))
 }
 
 /// Whether the one-directional transfer error of a correspondence is within tolerance, with `w` strictly positive.
@@ -126,29 +138,59 @@ fn seed_of(sorted: &[[f32; 4]]) -> u64 {
     })
 }
 
-/// SplitMix64 (Steele, Lea, Flood 2014): its numbers are part of every score, so they must never change with a
-/// library's version.
-struct Random(u64);
+/// How far a search has come.
+struct Progress {
+    /// Homographies scored.
+    scored: usize,
+    most_scored: usize,
+    /// Samples to draw; shrinks as inliers are found.
+    needed: usize,
+}
 
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mixed = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        mixed ^ (mixed >> 31)
+impl Progress {
+    /// Whether to go on after `drawn` samples.
+    fn goes_on(&self, drawn: usize) -> bool {
+        drawn < self.needed && self.scored < self.most_scored
     }
+}
 
-    /// Four different numbers below `n`, which is at least 4 and below 2^16.
-    fn four_of(&mut self, n: usize) -> [usize; 4] {
-        loop {
-            let bits = self.next();
-            let four = [0, 16, 32, 48].map(|shift| (((bits >> shift) & 0xffff) as usize * n) >> 16);
-            let [a, b, c, d] = four;
-            // Without short cuts, which would be mispredicted.
-            if !((a == b) | (a == c) | (a == d) | (b == c) | (b == d) | (c == d)) {
-                return four;
+/// The proper samples of a chunk and their numbers in it.
+struct Gathered {
+    samples: [Sample; CHUNK],
+    numbers: [u8; CHUNK],
+    len: usize,
+}
+
+impl Default for Gathered {
+    fn default() -> Self {
+        // What is not filled is solved along with the rest, and must name pairs that are there.
+        Self { samples: [[0; 4]; CHUNK], numbers: [0; CHUNK], len: 0 }
+    }
+}
+
+impl Gathered {
+    /// Replaces what was gathered by what is proper of the next chunk.
+    fn gather(&mut self, simd: Simd, points: &PointPairs, samples: &[Sample; CHUNK]) {
+        self.len = 0;
+        for (group, sixteen) in samples.as_chunks::<LANES>().0.iter().enumerate() {
+            let mut bits = homography::proper(simd, points, sixteen, MIN_AREA);
+            while bits != 0 {
+                let lane = bits.trailing_zeros() as usize;
+                bits &= bits - 1;
+                // Below CHUNK, which fits.
+                (self.samples[self.len], self.numbers[self.len]) = (sixteen[lane], (group * LANES + lane) as u8);
+                self.len += 1;
             }
         }
+    }
+
+    /// Groups to solve at once, each with the position of its first.
+    fn groups(&self) -> impl Iterator<Item = (usize, &[Sample; LANES])> {
+        let groups = self.len.div_ceil(LANES);
+        self.samples.as_chunks::<LANES>().0[..groups]
+            .iter()
+            .enumerate()
+            .map(|(group, samples)| (group * LANES, samples))
     }
 }
 
@@ -162,32 +204,46 @@ struct Search<'a> {
 
 impl Search<'_> {
     fn run(&mut self, seed: u64, settings: &RansacSettings) {
-        let mut random = Random(seed);
+        let mut sampler = Sampler::new(seed);
         let most_scored = settings.max_iterations as usize;
-        let (mut drawn, mut scored, mut needed) = (0, 0, most_scored * DRAWS_PER_HOMOGRAPHY);
-        while drawn < needed && scored < most_scored {
-            let samples = self.draw(&mut random);
-            let hypotheses = homography::solve_four(self.simd, &samples, MIN_AREA);
-            for lane in (0..LANES).filter(|&lane| hypotheses.valid[lane]) {
-                scored += 1;
-                if self.consider(&hypotheses.get(lane)) {
-                    needed = needed.min(self.draws_needed(settings));
-                }
+        let mut progress = Progress { scored: 0, most_scored, needed: most_scored * DRAWS_PER_HOMOGRAPHY };
+        let (mut samples, mut proper) = ([[0; 4]; CHUNK], Gathered::default());
+        for drawn in (0..).step_by(CHUNK) {
+            if !progress.goes_on(drawn) {
+                return;
             }
-            drawn += LANES;
+            sampler.fill(self.simd, self.points.len(), &mut samples);
+            proper.gather(self.simd, self.points, &samples);
+            if !self.try_samples(&proper, drawn, &mut progress, settings) {
+                return;
+            }
         }
     }
 
-    fn draw(&self, random: &mut Random) -> Samples {
-        let mut samples = [[[0.0; LANES]; 4]; 4];
-        #[allow(clippy::needless_range_loop, reason = "the lane is the innermost of three indices")]
-        for lane in 0..LANES {
-            for (corner, i) in random.four_of(self.points.len()).into_iter().enumerate() {
-                let pair = self.points.get(i);
-                (0..4).for_each(|axis| samples[axis][corner][lane] = pair[axis]);
+    /// Scores the samples gathered from a chunk, the first of which was number `drawn`; false once the search is over.
+    fn try_samples(
+        &mut self,
+        proper: &Gathered,
+        drawn: usize,
+        progress: &mut Progress,
+        settings: &RansacSettings,
+    ) -> bool {
+        let mut round = usize::MAX;
+        for (from, sixteen) in proper.groups() {
+            let hypotheses: Hypotheses = homography::solve(self.simd, self.points, sixteen);
+            for lane in 0..LANES.min(proper.len - from) {
+                let begun = drawn + usize::from(proper.numbers[from + lane]) / ROUND * ROUND;
+                if begun != round && !progress.goes_on(begun) {
+                    return false;
+                }
+                round = begun;
+                progress.scored += 1;
+                if self.consider(&hypotheses.get(lane)) {
+                    progress.needed = progress.needed.min(self.draws_needed(settings));
+                }
             }
         }
-        samples
+        true
     }
 
     /// Takes a homography that beats the best, and improves it locally; tells whether it did.

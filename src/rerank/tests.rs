@@ -1,5 +1,7 @@
 //! The room against outputs of the reference implementation, planted geometry and hostile input.
 
+mod parity;
+
 use super::mutual_nn::{Matcher, PreparedQuery};
 use super::ransac::{Estimate, Ransac, RansacSettings};
 use super::*;

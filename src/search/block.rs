@@ -2,7 +2,8 @@
 
 use super::IndexEntry;
 use super::filter::{Extent, PlaceAndTime};
-use crate::kernels::scan::{Codes, LENGTH};
+use crate::kernels::scan::{Codes, LENGTH, Rows};
+use crate::kernels::{quantise, simd};
 use crate::types::{GLOBAL_DIM, ReferenceId};
 
 const _: () = assert!(LENGTH == GLOBAL_DIM);
@@ -29,15 +30,16 @@ pub(super) struct Quantised {
 impl Quantised {
     /// Quantises symmetrically, the largest magnitude becoming 127.
     pub(super) fn new(vector: &[f32]) -> Self {
-        let peak = vector.iter().fold(0f32, |peak, value| peak.max(value.abs()));
-        let scale = peak / 127.0;
+        let simd = simd::selected();
+        let scale = quantise::largest(simd, vector) / 127.0;
         // A factor that is zero, subnormal or not finite would make the codes meaningless: all is error then.
         let scale = if scale.is_normal() { scale } else { 0.0 };
-        let code = |value: f32| if scale == 0.0 { 0 } else { (value / scale).round().clamp(-127.0, 127.0) as i8 };
-        let codes: [i8; LENGTH] = std::array::from_fn(|i| code(vector[i]));
-        let missed = |(value, code): (&f32, &i8)| (f64::from(*value) - f64::from(scale) * f64::from(*code)).powi(2);
-        let error: f64 = vector.iter().zip(&codes).map(missed).sum::<f64>().sqrt();
-        let square: f64 = vector.iter().map(|value| f64::from(*value).powi(2)).sum();
+        let mut codes = [0; LENGTH];
+        if scale != 0.0 {
+            quantise::quantise(simd, vector, scale, 1.0, &mut codes);
+        }
+        let (missed, square) = quantise::squared_lengths(simd, vector, &codes, scale);
+        let error = missed.sqrt();
         Self { codes: Codes::new(codes), scale, error: (error * (1.0 + 1e-6)) as f32, square: square as f32 }
     }
 }
@@ -71,6 +73,12 @@ impl Block {
 
     pub(super) fn len(&self) -> usize {
         self.ids.len()
+    }
+
+    /// What a scan reads.
+    pub(super) fn rows(&self) -> Rows<'_> {
+        let Self { codes, scales, errors, squares, longest, .. } = self;
+        Rows { codes, scales, errors, squares, longest: *longest }
     }
 
     /// Appends one reference.

@@ -29,7 +29,7 @@
 use super::Neighbour;
 use super::block::{Block, Quantised, Sealed};
 use super::filter::Sieve;
-use crate::kernels::scan::dot_products;
+use crate::kernels::scan::{Bounds, GROUP, Probe, bounds, dot_products, next_near};
 use crate::kernels::{Simd, simd};
 use crate::types::ReferenceId;
 use std::cell::RefCell;
@@ -38,9 +38,6 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 /// Share of |q|^2 + |x|^2 by which bounds are widened against rounding.
 const SLACK: f32 = 1.0 / 8192.0;
-
-/// Rows whose bounds are compared with the threshold at once.
-const STRIDE: usize = 16;
 
 /// Squared Euclidean distance, summed in 32 lanes: the same bits on every machine.
 pub(super) fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
@@ -65,8 +62,7 @@ pub(super) fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
 /// A query, prepared once.
 pub(super) struct Query<'a> {
     vector: &'a [f32],
-    quantised: Quantised,
-    length: f32,
+    probe: Probe,
     k: usize,
     sieve: Sieve,
     simd: Simd,
@@ -76,10 +72,11 @@ pub(super) struct Query<'a> {
 
 impl<'a> Query<'a> {
     pub(super) fn new(vector: &'a [f32], k: usize, sieve: Sieve) -> Self {
-        let quantised = Quantised::new(vector);
-        let length = quantised.square.sqrt() * (1.0 + 1e-6);
+        let Quantised { codes, scale, error, square } = Quantised::new(vector);
+        let length = square.sqrt() * (1.0 + 1e-6);
+        let probe = Probe { codes, scale, square, length, error, slack: SLACK };
         let threshold = AtomicU32::new(f32::INFINITY.to_bits());
-        Self { vector, quantised, length, k, sieve, simd: simd::selected(), threshold }
+        Self { vector, probe, k, sieve, simd: simd::selected(), threshold }
     }
 
     fn threshold(&self) -> f32 {
@@ -126,8 +123,8 @@ impl PartialOrd for Ordered {
 }
 
 thread_local! {
-    /// Dot products of one block, and the rows chosen by a filter.
-    static SCRATCH: RefCell<(Vec<i32>, Vec<u32>)> = const { RefCell::new((Vec::new(), Vec::new())) };
+    /// The rows of one block chosen by a filter.
+    static CHOSEN: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) };
 }
 
 impl Part {
@@ -146,50 +143,39 @@ impl Part {
         if !query.sieve.is_open() && !query.sieve.may_pass(&block.extent) {
             return;
         }
-        SCRATCH.with_borrow_mut(|(dots, chosen)| {
-            dots.resize(block.len(), 0);
-            if query.sieve.is_open() {
-                dot_products(query.simd, &query.quantised.codes, &block.codes, dots);
-                self.compare_all(query, block, number, dots, live);
-            } else {
+        if query.sieve.is_open() {
+            self.compare_all(query, block, number, live);
+        } else {
+            CHOSEN.with_borrow_mut(|chosen| {
                 chosen.clear();
                 let passing = (0..block.len()).filter(|&row| live(row) && query.sieve.passes(&block.places[row]));
                 chosen.extend(passing.map(|row| row as u32));
-                for &row in chosen.iter() {
-                    let row = row as usize;
-                    let (codes, dot) = (&block.codes[row..=row], &mut dots[row..=row]);
-                    dot_products(query.simd, &query.quantised.codes, codes, dot);
-                    let (lower, upper) = bounds(query, block, row, dots[row]);
-                    self.offer(query, number, row, lower, upper);
-                }
-            }
-        });
+                chosen.iter().for_each(|&row| self.compare_one(query, block, number, row as usize));
+            });
+        }
     }
 
-    #[expect(clippy::neg_cmp_op_on_partial_ord, reason = "a bound that is not a number keeps its row")]
-    fn compare_all(
-        &mut self,
-        query: &Query<'_>,
-        block: &Block,
-        number: usize,
-        dots: &[i32],
-        live: impl Fn(usize) -> bool,
-    ) {
-        let mut start = 0;
-        while start < dots.len() {
-            let end = (start + STRIDE).min(dots.len());
-            let threshold = query.threshold();
-            // Almost always none of a stride comes near; the loop has no branch so that it can be vectorised.
-            let near =
-                (start..end).fold(false, |near, row| near | !(bounds(query, block, row, dots[row]).0 > threshold));
-            if near {
-                for row in (start..end).filter(|&row| live(row)) {
-                    let (lower, upper) = bounds(query, block, row, dots[row]);
+    fn compare_all(&mut self, query: &Query<'_>, block: &Block, number: usize, live: impl Fn(usize) -> bool) {
+        let rows = block.rows();
+        let (mut from, mut found) = (0, Bounds::NONE);
+        // Almost always no row of a group comes near.
+        while let Some(group) = next_near(query.simd, &query.probe, &rows, from, query.threshold(), &mut found) {
+            for (row, (&lower, &upper)) in (group..).zip(found.lower.iter().zip(&found.upper)) {
+                if live(row) {
                     self.offer(query, number, row, lower, upper);
                 }
             }
-            start = end;
+            from = group + GROUP;
         }
+        let rest = block.len() - block.len() % GROUP..block.len();
+        rest.filter(|&row| live(row)).for_each(|row| self.compare_one(query, block, number, row));
+    }
+
+    fn compare_one(&mut self, query: &Query<'_>, block: &Block, number: usize, row: usize) {
+        let mut dot = [0];
+        dot_products(query.simd, &query.probe.codes, &block.codes[row..=row], &mut dot);
+        let (lower, upper) = bounds(&query.probe, &block.rows(), row, dot[0]);
+        self.offer(query, number, row, lower, upper);
     }
 
     fn offer(&mut self, query: &Query<'_>, block: usize, row: usize, lower: f32, upper: f32) {
@@ -257,16 +243,6 @@ impl Part {
             top.offer(squared_distance(query.vector, block.vector(row)), block.ids[row]);
         }
     }
-}
-
-/// Bounds on [`squared_distance`]; see the module's proof.
-#[inline(always)]
-fn bounds(query: &Query<'_>, block: &Block, row: usize, dot: i32) -> (f32, f32) {
-    let squares = query.quantised.square + block.squares[row];
-    let similarity = dot as f32 * (query.quantised.scale * block.scales[row]);
-    let error = query.length * block.errors[row] + query.quantised.error * block.longest;
-    let (middle, half) = (squares - 2.0 * similarity, 2.0 * error + SLACK * squares);
-    (middle - half, middle + half)
 }
 
 /// The k nearest so far.

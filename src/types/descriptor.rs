@@ -1,6 +1,7 @@
 //! What the model sees in one image: a global descriptor and key patches at three scales.
 
 use super::InvalidValue;
+use crate::kernels::{quantise, simd};
 use half::f16;
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -144,7 +145,12 @@ pub struct PackedPatches {
 
 impl PackedPatches {
     /// Quantises symmetrically, the largest magnitude of each descriptor becoming 127.
+    ///
+    /// # Panics
+    /// Where `PLACEFORMER_SIMD` asks for a level the CPU lacks; programs have checked that at start
+    /// ([`crate::kernels::self_check`]).
     pub fn quantise(patches: &KeyPatches) -> Self {
+        let simd = simd::selected();
         let counts = [0, 1, 2].map(|s| patches.scales[s].index.len());
         let total = counts.iter().sum();
         let mut packed = Self {
@@ -160,9 +166,11 @@ impl PackedPatches {
             packed.index.extend(scale.index.iter().map(|&i| i as u16));
             packed.attention.extend(scale.attention.iter().map(|&a| f16::from_f32(a)));
             for descriptor in scale.descriptors.chunks_exact(patches.dim) {
-                let peak = descriptor.iter().fold(0f32, |peak, v| peak.max(v.abs())).max(f32::MIN_POSITIVE);
+                let peak = quantise::largest(simd, descriptor).max(f32::MIN_POSITIVE);
                 packed.factor.push(peak / 127.0);
-                packed.codes.extend(descriptor.iter().map(|v| (v / peak * 127.0).round() as i8));
+                let start = packed.codes.len();
+                packed.codes.resize(start + patches.dim, 0);
+                quantise::quantise(simd, descriptor, peak, 127.0, &mut packed.codes[start..]);
             }
         }
         packed

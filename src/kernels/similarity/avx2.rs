@@ -3,7 +3,8 @@
 //! `vpmaddubsw` would take twice the products per instruction, but it saturates, so that exactness costs back a sign
 //! transfer and a second widening multiplication; per exact product both need the same slots of the multiplier ports.
 
-use super::{Best, BlockMaxima, Blocks, Line, PackedColumns, Quantised, SECTIONS, Scratch};
+use super::driver::{self, Level};
+use super::{BlockMaxima, Blocks, Line, PackedColumns, Quantised, SECTIONS, Scratch};
 use std::arch::x86_64::*;
 
 /// Columns of a panel: two vectors.
@@ -55,43 +56,6 @@ fn widen(rows: Quantised<'_>, scratch: &mut Scratch) {
     }
 }
 
-/// Dot products of six rows, `stride` values apart, with the 16 columns of a panel.
-///
-/// # Safety
-/// `rows` must point at `6 * stride` readable values, with `stride = 2 * panel.len()`.
-#[inline]
-#[target_feature(enable = "avx2")]
-unsafe fn dots(rows: *const i16, stride: usize, panel: &[Line<i16, 32>]) -> [[__m256i; 2]; TILE] {
-    let mut sums = [[_mm256_setzero_si256(); 2]; TILE];
-    for (k, line) in panel.iter().enumerate() {
-        // SAFETY: a line holds 64 bytes; row `r` has values up to `stride`, and 2k + 1 < stride.
-        unsafe {
-            let columns = line.0.as_ptr().cast::<__m256i>();
-            let (left, right) = (_mm256_load_si256(columns), _mm256_load_si256(columns.add(1)));
-            // Written out: with a loop over rows the compiler keeps the sums in memory.
-            macro_rules! rows {
-                ($($r:literal)*) => {$(
-                    let pair = _mm256_set1_epi32(rows.add($r * stride + 2 * k).cast::<i32>().read_unaligned());
-                    sums[$r][0] = _mm256_add_epi32(sums[$r][0], _mm256_madd_epi16(pair, left));
-                    sums[$r][1] = _mm256_add_epi32(sums[$r][1], _mm256_madd_epi16(pair, right));
-                )*};
-            }
-            rows!(0 1 2 3 4 5);
-        }
-    }
-    sums
-}
-
-/// Lane-wise running maximum with its index; on a tie or NaN what was held stays.
-#[inline]
-#[target_feature(enable = "avx2")]
-fn challenge(value: &mut __m256, index: &mut __m256i, new_value: __m256, new_index: __m256i) {
-    let better = _mm256_cmp_ps::<_CMP_GT_OQ>(new_value, *value);
-    // Of (new, held) `max` gives the second when the first is NaN.
-    *value = _mm256_max_ps(new_value, *value);
-    *index = _mm256_blendv_epi8(*index, new_index, _mm256_castps_si256(better));
-}
-
 /// See [`super::block_maxima`], which has checked the lengths.
 #[target_feature(enable = "avx2")]
 pub(super) fn block_maxima(
@@ -101,115 +65,131 @@ pub(super) fn block_maxima(
     scratch: &mut Scratch,
     out: &mut BlockMaxima,
 ) {
-    widen(rows, scratch);
-    let depth = columns.dim.div_ceil(2);
-    let (mut panel_base, mut column_base) = (0, 0);
-    for column_section in 0..SECTIONS {
-        let count = columns.counts[column_section];
-        scratch.reset_lanes(LANES);
-        for panel in 0..count.div_ceil(PANEL) {
-            let panel_index = panel_base + panel;
-            let view = Panel {
-                lines: &columns.pairs[panel_index * depth..][..depth],
-                factors: &columns.factors[panel_index * PANEL..][..PANEL],
-                first_column: column_base + panel * PANEL,
-                columns: PANEL.min(count - panel * PANEL),
-            };
-            let mut tile_base = 0;
-            for row_section in 0..SECTIONS {
-                let tiles = rows.counts[row_section].div_ceil(TILE);
-                if wanted[row_section][column_section] {
-                    let first_row = rows.start(row_section);
-                    let bests = &mut out.columns[row_section][view.first_column..][..view.columns];
-                    panel_maxima(&view, tile_base..tile_base + tiles, first_row, scratch, bests);
-                }
-                tile_base += tiles;
-            }
-        }
-        collect_rows(rows, scratch, &mut out.rows[column_section]);
-        panel_base += count.div_ceil(PANEL);
-        column_base += count;
-    }
+    // SAFETY: this function has the level's instructions.
+    unsafe { driver::block_maxima::<Avx2, TILE>(columns, rows, wanted, scratch, out) }
 }
 
-/// Sixteen columns, of which the first `columns` exist.
-struct Panel<'a> {
-    lines: &'a [Line<i16, 32>],
-    factors: &'a [f32],
-    first_column: usize,
-    columns: usize,
-}
+struct Avx2;
 
-/// Runs one panel over the tiles of one section of rows; the first of those is row `first_row`.
-#[target_feature(enable = "avx2")]
-fn panel_maxima(
-    panel: &Panel<'_>,
-    tiles: std::ops::Range<usize>,
-    first_row: usize,
-    scratch: &mut Scratch,
-    bests: &mut [Best],
-) {
-    let stride = panel.lines.len() * 2;
-    let padded = tiles.start * TILE..tiles.end * TILE;
-    let wide = &scratch.wide[padded.start * stride..padded.end * stride];
-    let row_factors = &scratch.factors[padded.clone()];
-    let lane_values = &mut scratch.lane_values[padded.start * LANES..padded.end * LANES];
-    let lane_indices = &mut scratch.lane_indices[padded.start * LANES..padded.end * LANES];
-    assert!(panel.factors.len() == PANEL);
-    let lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
-    let left_index = _mm256_add_epi32(_mm256_set1_epi32(panel.first_column as i32), lane);
-    let indices = [left_index, _mm256_add_epi32(left_index, _mm256_set1_epi32(LANES as i32))];
-    let mut best_values = [_mm256_set1_ps(f32::NEG_INFINITY); 2];
-    let mut best_indices = [_mm256_set1_epi32(-1); 2];
-    // SAFETY: the slices above hold `padded.len()` rows of `stride` values, one factor and eight lanes each; a tile
-    // starts at a row that is a multiple of TILE below that, so its six rows lie inside. `factors` holds 16 values.
-    unsafe {
-        let column_factors =
-            [_mm256_loadu_ps(panel.factors.as_ptr()), _mm256_loadu_ps(panel.factors.as_ptr().add(LANES))];
-        for tile in 0..tiles.len() {
-            let sums = dots(wide.as_ptr().add(tile * TILE * stride), stride, panel.lines);
-            for (r, sums) in sums.iter().enumerate() {
-                let row = tile * TILE + r;
-                let row_factor = _mm256_set1_ps(*row_factors.get_unchecked(row));
-                let row_index = _mm256_set1_epi32((first_row + row) as i32);
-                let values_at = lane_values.as_mut_ptr().add(row * LANES);
-                let indices_at = lane_indices.as_mut_ptr().add(row * LANES).cast::<__m256i>();
-                let (mut value, mut index) = (_mm256_loadu_ps(values_at), _mm256_loadu_si256(indices_at));
-                for half in 0..2 {
-                    let dot = _mm256_cvtepi32_ps(sums[half]);
-                    challenge(
-                        &mut best_values[half],
-                        &mut best_indices[half],
-                        _mm256_mul_ps(dot, row_factor),
-                        row_index,
-                    );
-                    challenge(&mut value, &mut index, _mm256_mul_ps(dot, column_factors[half]), indices[half]);
+impl Level<TILE> for Avx2 {
+    const LANES: usize = LANES;
+    type Code = i16;
+    type Line = Line<i16, 32>;
+    type Floats = __m256;
+    type Integers = __m256i;
+
+    #[inline(always)]
+    unsafe fn pad(rows: Quantised<'_>, scratch: &mut Scratch) {
+        // SAFETY: the caller vouches for AVX2.
+        unsafe { widen(rows, scratch) }
+    }
+
+    #[inline(always)]
+    fn padded(scratch: &Scratch) -> &[i16] {
+        &scratch.wide
+    }
+
+    #[inline(always)]
+    fn lines(columns: &PackedColumns) -> &[Self::Line] {
+        &columns.pairs
+    }
+
+    #[inline(always)]
+    fn lines_per_panel(dim: usize) -> usize {
+        dim.div_ceil(2)
+    }
+
+    #[inline(always)]
+    unsafe fn excess(_: &PackedColumns, _: usize) -> [__m256i; 2] {
+        // SAFETY: the caller vouches for AVX2.
+        unsafe { [_mm256_setzero_si256(); 2] }
+    }
+
+    #[inline(always)]
+    unsafe fn products(rows: *const i16, stride: usize, panel: &[Self::Line]) -> [[__m256i; 2]; TILE] {
+        // SAFETY: the caller vouches for AVX2.
+        let mut sums = unsafe { [[_mm256_setzero_si256(); 2]; TILE] };
+        for (k, line) in panel.iter().enumerate() {
+            // SAFETY: a line holds 64 bytes; row `r` has values up to `stride`, and 2k + 1 < stride.
+            unsafe {
+                let columns = line.0.as_ptr().cast::<__m256i>();
+                let (left, right) = (_mm256_load_si256(columns), _mm256_load_si256(columns.add(1)));
+                // Written out: with a loop over rows the compiler keeps the sums in memory.
+                macro_rules! rows {
+                    ($($r:literal)*) => {$(
+                        let pair = _mm256_set1_epi32(rows.add($r * stride + 2 * k).cast::<i32>().read_unaligned());
+                        sums[$r][0] = _mm256_add_epi32(sums[$r][0], _mm256_madd_epi16(pair, left));
+                        sums[$r][1] = _mm256_add_epi32(sums[$r][1], _mm256_madd_epi16(pair, right));
+                    )*};
                 }
-                _mm256_storeu_ps(values_at, value);
-                _mm256_storeu_si256(indices_at, index);
+                rows!(0 1 2 3 4 5);
             }
         }
+        sums
     }
-    let (mut values, mut rows) = ([0f32; PANEL], [0i32; PANEL]);
-    for half in 0..2 {
-        // SAFETY: both arrays hold two vectors.
+
+    #[inline(always)]
+    unsafe fn exact(products: __m256i, _: __m256i) -> __m256 {
+        // SAFETY: the caller vouches for AVX2.
+        unsafe { _mm256_cvtepi32_ps(products) }
+    }
+
+    #[inline(always)]
+    unsafe fn splat(value: f32) -> __m256 {
+        // SAFETY: the caller vouches for AVX2.
+        unsafe { _mm256_set1_ps(value) }
+    }
+
+    #[inline(always)]
+    unsafe fn splat_index(index: i32) -> __m256i {
+        // SAFETY: the caller vouches for AVX2.
+        unsafe { _mm256_set1_epi32(index) }
+    }
+
+    #[inline(always)]
+    unsafe fn indices_from(first: i32) -> __m256i {
+        // SAFETY: the caller vouches for AVX2.
+        unsafe { _mm256_add_epi32(_mm256_set1_epi32(first), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7)) }
+    }
+
+    #[inline(always)]
+    unsafe fn multiply(a: __m256, b: __m256) -> __m256 {
+        // SAFETY: the caller vouches for AVX2.
+        unsafe { _mm256_mul_ps(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn load(from: *const f32) -> __m256 {
+        // SAFETY: the caller vouches for AVX2 and eight elements.
+        unsafe { _mm256_loadu_ps(from) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_indices(from: *const i32) -> __m256i {
+        // SAFETY: the caller vouches for AVX2 and eight elements.
+        unsafe { _mm256_loadu_si256(from.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn store(to: *mut f32, values: __m256) {
+        // SAFETY: the caller vouches for AVX2 and eight elements.
+        unsafe { _mm256_storeu_ps(to, values) }
+    }
+
+    #[inline(always)]
+    unsafe fn store_indices(to: *mut i32, indices: __m256i) {
+        // SAFETY: the caller vouches for AVX2 and eight elements.
+        unsafe { _mm256_storeu_si256(to.cast(), indices) }
+    }
+
+    #[inline(always)]
+    unsafe fn challenge(value: &mut __m256, index: &mut __m256i, new_value: __m256, new_index: __m256i) {
+        // SAFETY: the caller vouches for AVX2.
         unsafe {
-            _mm256_storeu_ps(values.as_mut_ptr().add(half * LANES), best_values[half]);
-            _mm256_storeu_si256(rows.as_mut_ptr().add(half * LANES).cast(), best_indices[half]);
+            let better = _mm256_cmp_ps::<_CMP_GT_OQ>(new_value, *value);
+            // Of (new, held) `max` gives the second when the first is NaN.
+            *value = _mm256_max_ps(new_value, *value);
+            *index = _mm256_blendv_epi8(*index, new_index, _mm256_castps_si256(better));
         }
-    }
-    for (best, (&value, &row)) in bests.iter_mut().zip(values.iter().zip(&rows)) {
-        *best = Best { value, index: row as u32 };
-    }
-}
-
-/// Reduces the lanes of every row that exists.
-fn collect_rows(rows: Quantised<'_>, scratch: &Scratch, bests: &mut [Best]) {
-    let mut padded = 0;
-    for section in 0..SECTIONS {
-        for local in 0..rows.counts[section] {
-            bests[rows.start(section) + local] = scratch.reduce_lanes(padded + local, LANES);
-        }
-        padded += rows.counts[section].next_multiple_of(TILE);
     }
 }
