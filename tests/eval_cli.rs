@@ -1,7 +1,14 @@
-//! What `eval`, `import` and `match` say to wrong arguments, before any model is loaded.
+//! What `eval`, `import` and `match` say to wrong arguments, before any model is loaded; and `eval` from photos to
+//! figures, files and pages, on a small drawn town.
 
+#[path = "common/town.rs"]
+mod town;
+
+use placeformer::types::Calibration;
+use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output};
+use town::{SIZE, has_model, prints, succeeds, town};
 
 fn placeformer(arguments: &[&str], folder: &Path) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
@@ -94,4 +101,159 @@ fn match_refuses_a_picture_it_cannot_write_before_loading_the_model() {
     let folder = tempfile::tempdir().unwrap();
     let error = refusal(&["match", "a.jpg", "b.jpg", "--out", "match.gif"], folder.path());
     assert!(error.contains(".png"), "{error}");
+}
+
+/// `eval` on the town, with everything kept below `folder`.
+fn eval<'a>(more: &[&'a str]) -> Vec<&'a str> {
+    [&["eval", "--dataset", "csv", "--root", "town", "--input-size", SIZE, "--cache", "cache"], more].concat()
+}
+
+fn keys(value: &Value) -> Vec<&str> {
+    value.as_object().expect("an object").keys().map(String::as_str).collect()
+}
+
+/// Names of the references that show the place of each query that is mapped.
+fn positives(folder: &Path) -> Vec<(String, Vec<String>)> {
+    let text = std::fs::read_to_string(folder.join("town/ground_truth.csv")).unwrap();
+    let mut truth: Vec<(String, Vec<String>)> = Vec::new();
+    for (query, reference) in text.lines().skip(1).filter_map(|row| row.split_once(',')) {
+        match truth.last_mut() {
+            Some((last, references)) if last == query => references.push(reference.to_owned()),
+            _ => truth.push((query.to_owned(), vec![reference.to_owned()])),
+        }
+    }
+    truth.retain(|(_, references)| references[0] != "");
+    truth
+}
+
+#[test]
+fn a_run_measures_resumes_and_survives_lost_images() {
+    if !has_model() {
+        return;
+    }
+    let town = town("8", "2");
+    let folder = town.path();
+    let (first, said) = prints(folder, &eval(&["--json", "out.json"]));
+    assert!(first.contains("R@1") && !said.contains("described 0 images"), "{first}{said}");
+    let json: Value = serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
+    let queries = std::fs::read_dir(folder.join("town/queries")).unwrap().count();
+    assert_eq!(json["queries"], queries);
+    for stage in ["global", "reranked"] {
+        let recall = &json["recall"][stage];
+        let mut depths: Vec<u32> = keys(recall).iter().map(|key| key.parse().unwrap()).collect();
+        depths.sort_unstable();
+        assert_eq!(depths, [1, 5, 10, 20]);
+        let at = |k: &str| recall[k].as_f64().unwrap();
+        assert!(at("1") <= at("5") && at("5") <= at("10") && at("20") == 100.0, "{recall}");
+    }
+    assert!(["extract", "search", "rerank"].iter().all(|stage| json["seconds"][stage].as_f64().unwrap() > 0.0));
+    assert!(json["bytes_per_reference"].as_f64().unwrap() > 1000.0);
+    assert_eq!(json["config"]["candidates"], 100);
+
+    // One place loses a photo of two, another both.
+    let truth = positives(folder);
+    let lost = [&truth[0].1[0], &truth[1].1[0], &truth[1].1[1]];
+    lost.iter().for_each(|name| std::fs::remove_file(folder.join("town/database").join(name)).unwrap());
+    let (second, said) = prints(folder, &eval(&["--html", "out.html", "--pictures", "16"]));
+    assert!(said.contains("described 0 images"), "{said}");
+    assert!(second.contains("3 images could not be read"), "{second}");
+    let page = std::fs::read_to_string(folder.join("out.html")).unwrap();
+    assert!(page.contains("src=\"data:image/jpeg;base64,") && !page.contains("src=\"http"));
+    assert_eq!(page.matches("no right answer could be read").count(), 1);
+    // The other query shows the photo that is left.
+    let shown = format!("a right answer<br><span class=\"soft\">{}</span>", truth[0].1[1]);
+    assert!(page.contains(&shown), "{shown}");
+}
+
+#[test]
+fn a_prediction_file_has_a_line_for_every_query() {
+    if !has_model() {
+        return;
+    }
+    let town = town("3", "1");
+    let folder = town.path();
+    for (side, from) in [("database", "town/database"), ("query", "town/queries")] {
+        let target = folder.join("msls/test/miami").join(side);
+        std::fs::create_dir_all(target.join("images")).unwrap();
+        let mut index = ",key,all\n".to_owned();
+        let mut names: Vec<_> = std::fs::read_dir(folder.join(from)).unwrap().map(|e| e.unwrap().path()).collect();
+        names.sort();
+        for (row, path) in names.iter().enumerate() {
+            std::fs::copy(path, target.join("images").join(format!("{side}{row}.jpg"))).unwrap();
+            index += &format!("{row},{side}{row},True\n");
+        }
+        std::fs::write(target.join("subtask_index.csv"), index).unwrap();
+    }
+    std::fs::write(folder.join("msls/test/miami/query/images/query1.jpg"), b"torn").unwrap();
+    let arguments =
+        ["eval", "--dataset", "msls-test", "--root", "msls", "--cities", "miami", "--input-size", SIZE, "--cache", "c"];
+    let (_, said) = prints(folder, &[&arguments[..], &["--predictions", "out.txt"]].concat());
+    assert!(said.contains("1 of the queries could not be answered"), "{said}");
+    let text = std::fs::read_to_string(folder.join("out.txt")).unwrap();
+    let lines: Vec<Vec<&str>> = text.lines().map(|line| line.split(' ').collect()).collect();
+    let queries = std::fs::read_dir(folder.join("town/queries")).unwrap().count();
+    let references = std::fs::read_dir(folder.join("town/database")).unwrap().count();
+    let asked: Vec<String> = (0..queries).map(|row| format!("query{row}")).collect();
+    assert_eq!(lines.iter().map(|line| line[0]).collect::<Vec<_>>(), asked);
+    for line in &lines {
+        let answers: std::collections::BTreeSet<_> = line[1..].iter().collect();
+        assert_eq!((line.len(), answers.len()), (1 + references, references), "{line:?}");
+        assert!(answers.iter().all(|key| key.starts_with("database")), "{line:?}");
+    }
+}
+
+#[test]
+fn a_calibration_is_fitted_and_judged_elsewhere() {
+    if !has_model() {
+        return;
+    }
+    let town = town("8", "2");
+    let folder = town.path();
+    let calibrate = ["eval", "calibrate", "--dataset", "csv", "--root", "town", "--input-size", SIZE];
+    let fit = ["--cache", "cache", "--leave-out", "always", "--target-precision", "0.8", "--out", "own.json"];
+    let text = succeeds(folder, &[&calibrate[..], &fit].concat());
+    assert!(text.contains("re-ranked"), "{text}");
+    let bytes = std::fs::read(folder.join("own.json")).unwrap();
+    let calibration: Calibration = serde_json::from_slice(&bytes).unwrap();
+    assert!(calibration.curve(true).right > 0 && calibration.curve(true).wrong > 0);
+    // The same answers judge it: as many again cannot be right.
+    let more = ["--leave-out", "--calibration", "own.json", "--json", "out.json", "--html", "out.html"];
+    let text = succeeds(folder, &eval(&[&more[..], &["--pictures", "0"]].concat()));
+    assert!(text.contains("of the calibration given"), "{text}");
+    let json: Value = serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
+    assert_eq!(json["queries_left_out"], json["queries_with_match"]);
+    assert!(json["given_calibration"]["expected_calibration_error"].as_f64().unwrap() < 0.5, "{json}");
+    let page = std::fs::read_to_string(folder.join("out.html")).unwrap();
+    assert!(page.contains("the one given, error"));
+    // It holds for this re-ranking only.
+    let error = town::refusal(folder, &eval(&["--calibration", "own.json", "--scales", "1"]));
+    assert!(error.contains("re-ranking"), "{error}");
+}
+
+#[test]
+fn the_ablation_marks_its_base_once_on_every_axis() {
+    if !has_model() {
+        return;
+    }
+    let town = town("2", "1");
+    let folder = town.path();
+    let text = succeeds(folder, &eval(&["--ablate", "--json", "out.json", "--no-rerank"]));
+    let json: Value = serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
+    let rows = json["ablation"].as_array().unwrap();
+    let mut stars = std::collections::BTreeMap::new();
+    for row in rows {
+        let is_base = row["setting"].as_str().unwrap().ends_with('*');
+        *stars.entry(row["axis"].as_str().unwrap()).or_insert(0) += usize::from(is_base);
+    }
+    assert_eq!(
+        stars.into_iter().collect::<Vec<_>>(),
+        ["backbone", "caps", "codec", "exit block", "input size", "scales", "tau"].map(|axis| (axis, 1))
+    );
+    // The base is the base on whatever axis.
+    let base: Vec<&Value> = rows.iter().filter(|row| row["setting"].as_str().unwrap().ends_with('*')).collect();
+    assert!(base.iter().all(|row| row["recall"] == base[0]["recall"]), "{text}");
+    assert_eq!(
+        text.lines().filter(|line| line.starts_with("codec")).count(),
+        rows.iter().filter(|row| row["axis"] == "codec").count()
+    );
 }

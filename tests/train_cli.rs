@@ -1,52 +1,13 @@
 //! `train`, `head train`, `head fit` and `map rehead` from flags to files, on a small drawn town.
 
-use placeformer::extract::pull::model_path;
+#[path = "common/town.rs"]
+mod town;
+
 use placeformer::extract::{Aggregate, Head, Preset, VitWeights};
 use placeformer::store::{PlaceStore, SqliteStore, StoreConfig};
 use std::path::Path;
-use std::process::{Command, Output};
-
-/// Small images: what is tested is the way from flags to files, not recall.
-const SIZE: &str = "84x84";
-/// The same, as a setting.
-const SERVED_SIZE: &str = "{width=84,height=84}";
-
-/// Whether the model is there; a run without it must say so.
-fn has_model() -> bool {
-    let path = model_path(Preset::Dinov2Vits14).unwrap();
-    if !path.exists() && std::env::var("PLACEFORMER_TEST_NO_MODEL").is_ok_and(|value| value == "1") {
-        println!("skipped: no model at {} and PLACEFORMER_TEST_NO_MODEL=1", path.display());
-        return false;
-    }
-    assert!(path.exists(), "no model at {}: run `placeformer model pull dinov2-vits14` first", path.display());
-    true
-}
-
-fn placeformer(folder: &Path, arguments: &[&str]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    command.args(arguments).current_dir(folder).env_remove("PLACEFORMER_WEIGHTS").env_remove("PLACEFORMER_CONFIG");
-    command.env("PLACEFORMER_EXTRACT__INPUT_SIZE", SERVED_SIZE).output().expect("the binary was built")
-}
-
-fn succeeds(folder: &Path, arguments: &[&str]) -> String {
-    let output = placeformer(folder, arguments);
-    let error = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{arguments:?}: {error}");
-    String::from_utf8(output.stdout).unwrap()
-}
-
-fn refusal(folder: &Path, arguments: &[&str]) -> String {
-    let output = placeformer(folder, arguments);
-    assert!(!output.status.success(), "{arguments:?} succeeded");
-    String::from_utf8(output.stderr).unwrap()
-}
-
-/// Eight places along a street of 360 m, some references and a query each, and a query from elsewhere.
-fn town(views: &str) -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
-    succeeds(folder.path(), &["synth", "--out", "town", "--places", "8", "--views", views, "--size", "96x72"]);
-    folder
-}
+use std::process::Command;
+use town::{SERVED_SIZE, SIZE, has_model, refusal, succeeds, town};
 
 fn train(more: &[&'static str]) -> Vec<&'static str> {
     let data = ["--dataset", "csv", "--root", "town", "--input-size", SIZE];
@@ -59,7 +20,7 @@ fn a_head_is_trained_continued_and_given_to_a_map() {
     if !has_model() {
         return;
     }
-    let folder = town("2");
+    let folder = town("8", "2");
     let folder = folder.path();
     // The margin is wide so that every triplet teaches something.
     let command = train(&["--out", "run", "--learning-rate", "0.01", "--margin", "0.5", "--validation-share", "0.3"]);
@@ -126,7 +87,7 @@ fn the_last_block_is_trained_on_varied_images_of_drives() {
     if !has_model() {
         return;
     }
-    let folder = town("1");
+    let folder = town("8", "1");
     let text = "train --trainable last-1 --drives town/database town/queries --positive-frames 1 --negative-frames 2 \
                 --validation-share 0.4 --steps 1 --mine-every 1 --warm-up 0 --batch 2 --out blocks --input-size";
     let mut arguments: Vec<&str> = text.split_whitespace().collect();
@@ -143,7 +104,7 @@ fn the_last_block_is_trained_on_varied_images_of_drives() {
 
 #[test]
 fn what_cannot_be_trained_is_refused_before_the_model_is_loaded() {
-    let folder = town("1");
+    let folder = town("8", "1");
     let folder = folder.path();
     std::fs::create_dir(folder.join("empty")).unwrap();
     for (arguments, part) in [

@@ -12,6 +12,7 @@ mod error;
 pub mod evidence;
 pub mod features;
 pub mod measure;
+mod places;
 pub mod prediction;
 pub mod report;
 pub mod run;

@@ -11,13 +11,25 @@ const MSLS_ANSWERS: usize = 20;
 
 /// The Mapillary challenge's file: one line per query, its key and the keys of its answers, best first, separated by
 /// spaces. Sorted by re-ranking where that was done.
-pub fn write_msls(path: &Path, dataset: &Dataset, answers: &[Answer]) -> Result<(), EvalError> {
-    let line = |answer: &Answer| {
-        let mut keys = vec![key(&dataset.queries[answer.query])];
-        keys.extend(best(answer).into_iter().take(MSLS_ANSWERS).map(|index| key(&dataset.database[index])));
-        keys.join(" ")
+///
+/// The official evaluation stops at a query without a line. So a query that could not be read gets one too, in its
+/// place, with the first references of the database; how many there are is returned.
+pub fn write_msls(path: &Path, dataset: &Dataset, answers: &[Answer]) -> Result<usize, EvalError> {
+    let mut ranked: Vec<Option<Vec<usize>>> = vec![None; dataset.queries.len()];
+    for answer in answers {
+        let mut found = best(answer);
+        found.truncate(MSLS_ANSWERS);
+        ranked[answer.query] = Some(found);
+    }
+    let count = ranked.iter().flatten().map(Vec::len).max().unwrap_or(MSLS_ANSWERS.min(dataset.database.len()));
+    let unanswered = ranked.iter().filter(|found| found.is_none()).count();
+    let line = |(query, found): (&Item, Option<Vec<usize>>)| {
+        let found = found.unwrap_or_else(|| (0..count).collect());
+        let keys = found.into_iter().map(|index| key(&dataset.database[index]));
+        std::iter::once(key(query)).chain(keys).collect::<Vec<_>>().join(" ")
     };
-    write_lines(path, answers.iter().map(line))
+    write_lines(path, dataset.queries.iter().zip(ranked).map(line))?;
+    Ok(unanswered)
 }
 
 /// The visual localisation benchmark's file: `camera/timestamp.jpg qw qx qy qz tx ty tz` of the world-to-camera
@@ -77,15 +89,19 @@ mod tests {
     #[test]
     fn msls_lines_hold_keys_best_first() {
         let database = (0..30).map(|i| Item::new(format!("miami/database/k{i}"), "x")).collect();
-        let dataset = dataset(&["miami/query/q0", "miami/query/q1"], database);
+        let dataset = dataset(&["miami/query/q0", "miami/query/torn", "miami/query/q1"], database);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("msls.txt");
         let all: Vec<usize> = (0..30).collect();
-        write_msls(&path, &dataset, &[answer(0, &[1, 2], &[2, 1]), answer(1, &all, &[])]).unwrap();
+        // Answers may come in any order; the file keeps the data set's.
+        let unanswered = write_msls(&path, &dataset, &[answer(2, &all, &[]), answer(0, &[1, 2], &[2, 1])]).unwrap();
         let text = std::fs::read_to_string(&path).unwrap();
         let lines: Vec<&str> = text.lines().collect();
+        assert_eq!((lines.len(), unanswered), (3, 1));
         assert_eq!(lines[0], "q0 k2 k1");
-        assert_eq!((lines[1].split(' ').count(), lines[1].ends_with(" k19")), (21, true));
+        assert_eq!((lines[2].split(' ').count(), lines[2].ends_with(" k19")), (21, true));
+        // A query that was not answered has as many keys as the others.
+        assert_eq!(lines[1].replacen("torn", "q1", 1), lines[2]);
     }
 
     #[test]

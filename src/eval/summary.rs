@@ -8,7 +8,7 @@ use super::measure::{self, Interval, Judged, PoseAccuracy, RECALL_AT, Rejection,
 use super::run::{Answer, QuerySeconds};
 use crate::extract::ExtractConfig;
 use crate::rerank::RerankConfig;
-use crate::types::{ConfidenceWeights, ModelId};
+use crate::types::{Calibration, ConfidenceWeights, ModelId};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -71,7 +71,7 @@ pub struct Bytes {
 pub struct CalibrationSummary {
     /// Fitted on all judged queries.
     pub fitted: ConfidenceWeights,
-    /// 0 to 1, of predictions made by five-fold cross-validation.
+    /// 0 to 1, of predictions made by five-fold cross-validation, places kept whole.
     pub expected_calibration_error: f64,
     /// Of the same predictions.
     pub bins: Vec<ReliabilityBin>,
@@ -120,6 +120,8 @@ pub struct Summary {
     pub queries_with_match: usize,
     /// Of these, queries known to have none: they judge rejection.
     pub queries_without_match: usize,
+    /// Queries asked again with their own place left out of the database; they judge rejection too.
+    pub queries_left_out: usize,
     /// Images searched in.
     pub database: usize,
     /// Recall in percent at 1, 5, 10, 20; null if no query has a known match.
@@ -143,6 +145,9 @@ pub struct Summary {
     /// that was done; absent if it carries none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub shipped_calibration: Option<Applied>,
+    /// The same of a calibration that was given to be judged.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub given_calibration: Option<Applied>,
     /// Mean seconds per image and per query.
     pub seconds: Seconds,
     /// Mean bytes of one reference.
@@ -188,20 +193,32 @@ pub struct Outcome {
 /// Fewest right and fewest wrong answers a calibration is fitted on.
 const CALIBRATION_MINIMUM: usize = 5;
 
-/// Measures the answers.
+/// What was asked, and how long it took.
+#[derive(Debug, Clone, Copy)]
+pub struct Asked<'a> {
+    /// The answers to the data set as it is.
+    pub answers: &'a [Answer],
+    /// Answers to the same queries with their own place left out of the database: none of them can be right.
+    pub left_out: &'a [Answer],
+    /// Mean seconds per query.
+    pub seconds: QuerySeconds,
+}
+
+/// Measures the answers; `given` is a calibration to be judged on them beside the model's own.
 pub fn summarise(
     dataset: &Dataset,
     database: &Features,
     queries: &Features,
-    answers: &[Answer],
-    seconds: QuerySeconds,
+    asked: Asked<'_>,
     config: RunConfig,
+    given: Option<&Calibration>,
 ) -> Result<Summary, EvalError> {
+    let Asked { answers, left_out, seconds } = asked;
     let view = View { dataset, reranked: config.rerank.is_some() };
     let all: Vec<&Answer> = answers.iter().collect();
     let judged: Vec<&Answer> = all.iter().copied().filter(|a| dataset.truth[a.query] != Truth::Unknown).collect();
     let with_match = view.with_match(&all);
-    let best = BestAnswers::of(dataset, answers);
+    let best = BestAnswers::of(dataset, answers, left_out);
     let mut unreadable = database.unreadable.clone();
     unreadable.extend(queries.unreadable.iter().cloned());
     let bytes = Bytes {
@@ -219,15 +236,17 @@ pub fn summarise(
         queries: answers.len(),
         queries_with_match: with_match.len(),
         queries_without_match: judged.len() - with_match.len(),
+        queries_left_out: left_out.len(),
         database: dataset.database.len() - database.unreadable.len(),
         recall: Both::of(view.reranked, |stage| view.recall(&with_match, stage)),
         recall_interval: Both::of(view.reranked, interval),
         map: Both::of(view.reranked, |stage| view.mean_average_precision(&with_match, stage)),
-        rejection: Both::of(view.reranked, |stage| measure::rejection(&view.judged(&judged, stage))),
+        rejection: Both::of(view.reranked, |stage| measure::rejection(&view.judged(&judged, left_out, stage))),
         poses: view.poses(&all),
         groups: view.groups(&all),
         calibration: fitted_here(&best, config.seed),
         shipped_calibration: shipped_here(&best, &config),
+        given_calibration: given.and_then(|given| given_here(&best, given, config.rerank.is_some())),
         seconds: Seconds {
             decode: database.seconds.decode,
             extract: database.seconds.extract,
@@ -307,16 +326,17 @@ impl<'a> View<'a> {
         }
     }
 
-    fn judged(&self, answers: &[&Answer], stage: Stage) -> Vec<Judged> {
-        let judge = |answer: &&Answer| {
-            let positives = self.positives(answer);
+    fn judged(&self, answers: &[&Answer], left_out: &[Answer], stage: Stage) -> Vec<Judged> {
+        let judge = |(answer, positives): (&Answer, &[usize])| {
             let (index, score) = match stage {
                 Stage::Global => answer.global.first().map(|n| (n.index, -f64::from(n.distance)))?,
                 Stage::Reranked => answer.reranked.first().map(|c| (c.index, f64::from(c.score.spatial_score)))?,
             };
             Some(Judged { score, correct: positives.binary_search(&index).is_ok(), has_match: !positives.is_empty() })
         };
-        answers.iter().filter_map(judge).collect()
+        let as_they_are = answers.iter().map(|&answer| (answer, self.positives(answer)));
+        let without: &[usize] = &[];
+        as_they_are.chain(left_out.iter().map(|answer| (answer, without))).filter_map(judge).collect()
     }
 
     fn poses(&self, answers: &[&Answer]) -> Option<Both<[PoseAccuracy; 3]>> {
@@ -357,7 +377,8 @@ fn fitted_here(best: &BestAnswers, seed: u64) -> Option<CalibrationSummary> {
         return None;
     }
     let fitted = measure::fit(answers, measure::RIDGE).ok()?;
-    let bins = measure::reliability(&measure::cross_validate(answers, measure::RIDGE, measure::FOLDS, seed));
+    let unseen = measure::cross_validate(answers, measure::RIDGE, measure::FOLDS, seed);
+    let bins = measure::reliability(&measure::predictions_of(&unseen));
     Some(CalibrationSummary { fitted, expected_calibration_error: measure::calibration_error(&bins), bins })
 }
 
@@ -370,91 +391,11 @@ fn shipped_here(best: &BestAnswers, config: &RunConfig) -> Option<Applied> {
     (!answers.is_empty()).then(|| Applied::of(&curve, answers))
 }
 
-#[cfg(test)]
-mod tests {
-    use super::super::datasets::Item;
-    use super::super::run::{Candidate, Neighbour};
-    use super::*;
-    use crate::rerank::PairScore;
-
-    fn answer(query: usize, global: &[usize], reranked: &[(usize, u32)]) -> Answer {
-        let candidate = |&(index, spatial_score): &(usize, u32)| Candidate {
-            index,
-            distance: 0.5,
-            score: PairScore { spatial_score, combinations: Vec::new() },
-        };
-        Answer {
-            query,
-            global: global
-                .iter()
-                .enumerate()
-                .map(|(rank, &index)| Neighbour { index, distance: rank as f32 })
-                .collect(),
-            reranked: reranked.iter().map(candidate).collect(),
-        }
-    }
-
-    fn features(n: usize, seconds: f64) -> Features {
-        let mut features = Features::empty_for_tests(n);
-        features.dim = 256;
-        features.pooled_dim = 384;
-        features.patch_bytes = 1000.0;
-        features.seconds.extract = seconds;
-        features
-    }
-
-    #[test]
-    fn a_run_by_hand() {
-        let truth = vec![Truth::Positives(vec![1]), Truth::Positives(vec![0, 2]), Truth::NoMatch, Truth::Unknown];
-        let items = |n: usize| (0..n).map(|i| Item::new(i.to_string(), "x")).collect();
-        let dataset = Dataset {
-            name: "hand".into(),
-            database: items(3),
-            queries: items(4),
-            truth,
-            skipped: Vec::new(),
-            notes: Vec::new(),
-        };
-        let answers = [
-            answer(0, &[0, 1, 2], &[(1, 40), (0, 5)]),
-            answer(1, &[0, 1, 2], &[(1, 9), (2, 8)]),
-            answer(2, &[2, 1, 0], &[(2, 3)]),
-            answer(3, &[2, 1, 0], &[(2, 99)]),
-        ];
-        let config = RunConfig {
-            model: ModelId::new("m"),
-            global: GlobalKind::Head,
-            candidates: 3,
-            extract: ExtractConfig::default(),
-            rerank: Some(RerankConfig::default()),
-            bootstrap: 100,
-            seed: 1,
-        };
-        let seconds = QuerySeconds { search: 0.1, load: 0.2, rerank: 0.3 };
-        let summary = summarise(&dataset, &features(3, 2.0), &features(4, 9.0), &answers, seconds, config).unwrap();
-        assert_eq!((summary.queries, summary.queries_with_match, summary.queries_without_match), (4, 2, 1));
-        assert_eq!((summary.recall.global[&1], summary.recall.global[&5]), (Some(50.0), Some(100.0)));
-        assert_eq!(summary.recall.reranked.as_ref().unwrap()[&1], Some(50.0));
-        // S = 40 is right, 9 wrong, 3 has no match; the unlabelled query does not count.
-        let rejection = summary.rejection.reranked.as_ref().unwrap();
-        assert_eq!((rejection.curve.len(), rejection.recall_at_full_precision), (3, 50.0));
-        assert_eq!(summary.bytes_per_reference, 1024.0 + 768.0 + 1000.0);
-        let json = serde_json::to_value(&summary).unwrap();
-        assert_eq!(json["recall"]["global"]["1"], 50.0);
-        assert_eq!(json["seconds"]["extract"], 2.0);
-        assert_eq!(json["queries"], 4);
-        for key in ["1", "5", "10", "20"] {
-            assert!(json["recall"]["reranked"][key].is_number());
-        }
-        assert!(json["calibration"].is_null());
-        let outcome = &summary.outcomes[1];
-        assert_eq!((outcome.global_rank, outcome.reranked_rank), (Some(1), Some(2)));
-        assert_eq!((outcome.spatial_score, outcome.positive_score), (Some(9), Some(8)));
-        assert_eq!(summary.outcomes[2].reranked_rank, None);
-        let text = super::super::report::text(&summary);
-        assert!(text.contains("hand: 4 queries (2 with a match, 1 without) against 3 references"), "{text}");
-        let page = super::super::report::html(&summary, &dataset, &answers, "");
-        assert_eq!(page.matches("<svg").count(), 3);
-        assert!(!page.contains("NaN") && !page.contains("src=\"http"));
-    }
+/// What a given calibration comes to on these answers.
+fn given_here(best: &BestAnswers, given: &Calibration, reranked: bool) -> Option<Applied> {
+    let answers = if reranked { &best.reranked } else { &best.global };
+    (!answers.is_empty()).then(|| Applied::of(given.curve(reranked), answers))
 }
+
+#[cfg(test)]
+mod tests;

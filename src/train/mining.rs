@@ -1,70 +1,91 @@
 //! Hard negatives: the images that look most like a query although they show another place.
 //!
-//! A random negative is soon farther than the margin and teaches nothing. Before every cycle each query's nearest
-//! descriptors among the allowed ones are found by exact comparison; where the database is huge, among a random pool
-//! drawn anew each cycle, so that the cost stays bounded and every image gets its turn.
+//! A random negative is soon farther than the margin and teaches nothing. Before every cycle the nearest descriptors
+//! among the allowed ones are found, by exact comparison, for each query the cycle will ask; where the database is huge,
+//! among a random pool drawn anew each cycle. Nothing else is embedded, so a cycle costs the same however large the data
+//! are, and every image gets its turn.
 
-use super::triplets::TripletSet;
+use super::TrainError;
+use super::triplets::{Side, TripletSet};
 use rand::SeedableRng;
 use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
+use std::collections::HashMap;
 
-/// Descriptors of both sides, `[n, dim]` row-major.
+/// Descriptors of the images that were embedded, by image.
 pub(super) struct Embeddings {
-    pub(super) dim: usize,
-    pub(super) queries: Vec<f32>,
-    pub(super) database: Vec<f32>,
+    dim: usize,
+    rows: Vec<f32>,
+    places: HashMap<(Side, u32), usize>,
 }
 
-/// The `count` hardest negatives of every query of `usable`, hardest first.
+impl Embeddings {
+    /// Takes the rows, `[images, dim]`, in the order of `images`.
+    pub(super) fn new(dim: usize, rows: Vec<f32>, images: impl IntoIterator<Item = (Side, u32)>) -> Self {
+        let places = images.into_iter().enumerate().map(|(place, image)| (image, place)).collect();
+        Self { dim, rows, places }
+    }
+
+    /// Gives queries the descriptors of the database images of the same index: those of a drive, whose frames do both.
+    pub(super) fn share_with_queries(&mut self) {
+        let shared: Vec<_> = self.places.iter().map(|(&(_, index), &place)| ((Side::Query, index), place)).collect();
+        self.places.extend(shared);
+    }
+
+    /// The descriptor of an image.
+    ///
+    /// # Errors
+    /// It is not among those embedded.
+    pub(super) fn of(&self, side: Side, index: u32) -> Result<&[f32], TrainError> {
+        let place = self
+            .places
+            .get(&(side, index))
+            .ok_or_else(|| TrainError::Tensor(format!("{side:?} image {index} was not embedded in this cycle")))?;
+        Ok(&self.rows[place * self.dim..(place + 1) * self.dim])
+    }
+
+    /// Descriptors of several database images, each with its index.
+    pub(super) fn of_database(&self, indices: &[u32]) -> Result<Vec<(u32, &[f32])>, TrainError> {
+        indices.iter().map(|&index| Ok((index, self.of(Side::Database, index)?))).collect()
+    }
+}
+
+/// The `count` hardest negatives of every query of `queries` among the images of `pool`, hardest first.
 pub(super) fn hardest_negatives(
     set: &TripletSet,
-    usable: &[usize],
+    queries: &[u32],
     embeddings: &Embeddings,
     count: usize,
-    pool: usize,
-    seed: u64,
-) -> Vec<Vec<u32>> {
-    let candidates = pool_of(set.database.len(), pool, seed);
-    usable
-        .par_iter()
-        .map(|&query| {
-            let descriptor = row(&embeddings.queries, query, embeddings.dim);
-            let mut scored: Vec<(f32, u32)> = candidates
-                .iter()
-                .filter(|candidate| set.near[query].binary_search(candidate).is_err())
-                .map(|&candidate| {
-                    (
-                        squared_distance(descriptor, row(&embeddings.database, candidate as usize, embeddings.dim)),
-                        candidate,
-                    )
-                })
-                .collect();
-            let order = |a: &(f32, u32), b: &(f32, u32)| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1));
-            if scored.len() > count {
-                scored.select_nth_unstable_by(count, order);
-                scored.truncate(count);
-            }
-            scored.sort_unstable_by(order);
-            scored.into_iter().map(|(_, candidate)| candidate).collect()
-        })
-        .collect()
+    pool: &[u32],
+) -> Result<HashMap<u32, Vec<u32>>, TrainError> {
+    let candidates = embeddings.of_database(pool)?;
+    let order = |a: &(f32, u32), b: &(f32, u32)| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1));
+    let mine = |&query: &u32| {
+        let descriptor = embeddings.of(Side::Query, query)?;
+        let near = &set.near[query as usize];
+        let allowed = candidates.iter().filter(|(candidate, _)| near.binary_search(candidate).is_err());
+        let mut scored: Vec<(f32, u32)> =
+            allowed.map(|&(candidate, row)| (squared_distance(descriptor, row), candidate)).collect();
+        if scored.len() > count {
+            scored.select_nth_unstable_by(count, order);
+            scored.truncate(count);
+        }
+        scored.sort_unstable_by(order);
+        Ok((query, scored.into_iter().map(|(_, candidate)| candidate).collect()))
+    };
+    queries.par_iter().map(mine).collect()
 }
 
-/// Ascending indices: everything, or `pool` drawn at random.
-fn pool_of(database: usize, pool: usize, seed: u64) -> Vec<u32> {
-    if database <= pool {
+/// Ascending indices into a database of `database` images: all, or `most` drawn at random.
+pub(super) fn draw_pool(database: usize, most: usize, seed: u64) -> Vec<u32> {
+    if database <= most {
         return (0..database as u32).collect();
     }
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut drawn: Vec<u32> = index::sample(&mut rng, database, pool).into_iter().map(|i| i as u32).collect();
+    let mut drawn: Vec<u32> = index::sample(&mut rng, database, most).into_iter().map(|i| i as u32).collect();
     drawn.sort_unstable();
     drawn
-}
-
-pub(super) fn row(rows: &[f32], index: usize, dim: usize) -> &[f32] {
-    &rows[index * dim..(index + 1) * dim]
 }
 
 pub(super) fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
@@ -81,22 +102,36 @@ mod tests {
         TripletSet { queries: paths(1), database: paths(database), positives: vec![vec![0]], near: vec![near] }
     }
 
+    /// One query at 0 and database images at `database`.
+    fn embeddings(database: &[f32]) -> Embeddings {
+        let rows = std::iter::once(0.0).chain(database.iter().copied()).collect();
+        let images = (0..database.len() as u32).map(|index| (Side::Database, index));
+        Embeddings::new(1, rows, std::iter::once((Side::Query, 0)).chain(images))
+    }
+
     #[test]
     fn the_nearest_allowed_descriptors_come_first() {
-        let embeddings = Embeddings { dim: 1, queries: vec![0.0], database: vec![0.1, 0.2, 5.0, 0.3, 0.2] };
-        let mined = hardest_negatives(&set(vec![0], 5), &[0], &embeddings, 3, 100, 1);
-        assert_eq!(mined, [[1, 4, 3]]);
+        let embeddings = embeddings(&[0.1, 0.2, 5.0, 0.3, 0.2]);
+        let mined = hardest_negatives(&set(vec![0], 5), &[0], &embeddings, 3, &[0, 1, 2, 3, 4]).unwrap();
+        assert_eq!(mined[&0], [1, 4, 3]);
     }
 
     #[test]
     fn a_pool_bounds_the_work_and_still_never_offers_near_images() {
-        let database: Vec<f32> = (0..1000).map(|i| i as f32).collect();
-        let embeddings = Embeddings { dim: 1, queries: vec![0.0], database };
-        let near: Vec<u32> = (0..500).collect();
+        let embeddings = embeddings(&(0..1000).map(|i| i as f32).collect::<Vec<_>>());
+        let set = set((0..500).collect(), 1000);
         for seed in 0..5 {
-            let mined = hardest_negatives(&set(near.clone(), 1000), &[0], &embeddings, 10, 50, seed);
-            assert!(mined[0].iter().all(|&i| i >= 500) && !mined[0].is_empty());
-            assert_eq!(mined, hardest_negatives(&set(near.clone(), 1000), &[0], &embeddings, 10, 50, seed));
+            let pool = draw_pool(1000, 50, seed);
+            assert_eq!((pool.len(), &pool), (50, &draw_pool(1000, 50, seed)));
+            let mined = hardest_negatives(&set, &[0], &embeddings, 10, &pool).unwrap();
+            assert!(mined[&0].iter().all(|i| *i >= 500 && pool.contains(i)) && !mined[&0].is_empty());
         }
+        assert_ne!(draw_pool(1000, 50, 1), draw_pool(1000, 50, 2));
+        assert_eq!(draw_pool(3, 50, 1), [0, 1, 2]);
+    }
+
+    #[test]
+    fn an_image_that_was_not_embedded_is_an_error() {
+        assert!(hardest_negatives(&set(vec![0], 9), &[0], &embeddings(&[0.1, 0.2]), 3, &[1, 7]).is_err());
     }
 }

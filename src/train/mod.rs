@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! data set --triplets--> positives within 10 m, the rest beyond 25 m
-//!    cycle: embed everything --mining--> hardest negatives of each query
+//!    cycle: draw the queries, embed them, their positives and a pool --mining--> hardest negatives of each query
 //!           N steps of triplets --loss--> --adam--> weights      (learning rate by schedule)
 //!           validation recall --> best weights kept, stop when it no longer improves
 //!           checkpoint (weights, moments, counters), log line
@@ -50,5 +50,5 @@ pub use holdout::{Drives, Holdout};
 pub use log::{CycleRecord, read_log};
 pub use pooled_cache::PooledCache;
 pub use schedule::Schedule;
-pub use trainer::{Outcome, Session};
+pub use trainer::{Outcome, Progress, Session};
 pub use triplets::{Side, TripletSet};

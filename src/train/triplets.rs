@@ -6,7 +6,7 @@ use crate::types::ContentHash;
 use std::path::PathBuf;
 
 /// One side of a triplet.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Side {
     /// An image that asks.
     Query,

@@ -4,9 +4,7 @@ use super::{CacheArgs, DataArgs, Described, RerankArgs, write};
 use crate::cli::client::{ServerArgs, ServerClient};
 use crate::cli::model_args::ModelOptions;
 use crate::eval::calibrate::{BestAnswers, LeaveOut, OwnPlaces, Purpose, calibrate};
-use crate::eval::datasets::Dataset;
 use crate::eval::features::GlobalKind;
-use crate::eval::run::search_all;
 use crate::types::{Calibration, MapName};
 use anyhow::{Context, ensure};
 use std::path::PathBuf;
@@ -71,7 +69,9 @@ pub(super) fn run(args: CalibrateArgs) -> anyhow::Result<()> {
     let dataset = args.data.load()?;
     let extract = args.model.extract_config()?;
     let described = Described::new(&args.model, &extract, &args.output.cache, &dataset, GlobalKind::Head)?;
-    let answers = best_answers(&args, &dataset, &described)?;
+    let own = OwnPlaces::of(&dataset, args.fit.leave_out, args.data.radius);
+    let answered = described.answer(&dataset, own.as_ref(), args.rerank.candidates, Some(&args.rerank.config()))?;
+    let answers = BestAnswers::of(&dataset, &answered.answers, &answered.left_out);
     let fitted = calibrate(
         &answers,
         Purpose {
@@ -90,22 +90,6 @@ pub(super) fn run(args: CalibrateArgs) -> anyhow::Result<()> {
         store(args.server, map, &fitted.calibration)?;
     }
     Ok(())
-}
-
-fn best_answers(args: &CalibrateArgs, dataset: &Dataset, described: &Described) -> anyhow::Result<BestAnswers> {
-    let (candidates, config) = (args.rerank.candidates, args.rerank.config());
-    let own = OwnPlaces::of(dataset, args.fit.leave_out, args.data.radius);
-    let wanted = |query| own.as_ref().map_or(candidates, |own| own.widened(query, candidates));
-    let (mut answers, _) = search_all(&described.database, &described.queries, wanted);
-    if let Some(own) = &own {
-        eprintln!("each query is also asked with its own place left out of the database");
-        answers.iter_mut().for_each(|answer| own.trim(answer, candidates));
-    }
-    let (answers, _) = described.rerank(answers, &config)?;
-    Ok(match &own {
-        Some(own) => BestAnswers::with_left_out(dataset, own, &answers, candidates),
-        None => BestAnswers::of(dataset, &answers),
-    })
 }
 
 fn store(server: ServerArgs, map: &MapName, calibration: &Calibration) -> anyhow::Result<()> {

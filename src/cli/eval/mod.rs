@@ -5,23 +5,32 @@ mod calibrate;
 use super::data_args::ReadArgs;
 use super::model_args::ModelOptions;
 use crate::eval::ablate::{Base, ablate};
+use crate::eval::calibrate::{LeaveOut, OwnPlaces};
 use crate::eval::datasets::{self, Dataset, DatasetKind, DatasetOptions};
 use crate::eval::features::{Describe, FeatureCache, Features, GlobalKind, ModelDescriber};
 use crate::eval::report::{Painter, gallery};
 use crate::eval::run::{Answer, QuerySeconds, rerank_all, search_all};
-use crate::eval::summary::{RunConfig, Summary, summarise};
+use crate::eval::summary::{Asked, RunConfig, Summary, summarise};
 use crate::eval::{EvalError, prediction, report};
 use crate::extract::{ExtractConfig, Extractor, Preset};
 use crate::image::ImageConfig;
 use crate::rerank::{RerankConfig, Reranker};
-use crate::types::ScaleSet;
+use crate::types::{Calibration, ModelId, ScaleSet};
 use anyhow::{Context, bail, ensure};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 
+const EXAMPLES: &str = "Examples:
+  placeformer eval --dataset msls-val --root /data/msls --html report.html
+  placeformer eval --dataset msls-test --root /data/msls --predictions answers.txt  (the challenge's file)
+  placeformer eval --dataset csv --root DIR --leave-out --calibration own.json      (can unknown places be told?)
+
+The 95% intervals come from resampling queries as if they were independent. Frames that follow each other along a street
+are not, so there the truth is wider.";
+
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
-#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true, after_help = EXAMPLES)]
 pub struct EvalArgs {
     #[command(subcommand)]
     action: Option<Action>,
@@ -87,6 +96,9 @@ struct DataArgs {
     /// Greatest frame distance of a positive (Nordland).
     #[arg(long, default_value_t = 10, value_name = "FRAMES")]
     frame_tolerance: u64,
+    /// Exchange the seasons of Nordland: winter as the database, summer as the queries.
+    #[arg(long)]
+    swap: bool,
 }
 
 /// What is done to the images.
@@ -101,6 +113,14 @@ struct MethodArgs {
     /// Leave re-ranking out.
     #[arg(long)]
     no_rerank: bool,
+    /// Ask every query a second time with its own place left out of the database (its positives, and all within four
+    /// times the radius), so that rejection is measured where the ground truth names no unknown place. Recall is that of
+    /// the first time; times are those of both.
+    #[arg(long)]
+    leave_out: bool,
+    /// Show how far the confidences of this calibration (of `eval calibrate --out`) can be believed here.
+    #[arg(long, value_name = "FILE")]
+    calibration: Option<PathBuf>,
     /// Repeat along the axes of the paper's ablation tables.
     #[arg(long)]
     ablate: bool,
@@ -175,7 +195,7 @@ fn run_measure(args: MeasureArgs) -> anyhow::Result<()> {
     let measured = measure(&args, &dataset, &extract)?;
     print!("{}", report::text(&measured.summary));
     if let Some(path) = &args.output.predictions {
-        write_predictions(path, &args, &dataset, &measured.answers)?;
+        write_predictions(path, &args, &dataset, &measured.answered.answers)?;
     }
     let mut details = String::new();
     let mut json = serde_json::to_value(&measured.summary)?;
@@ -192,8 +212,9 @@ fn run_measure(args: MeasureArgs) -> anyhow::Result<()> {
         let limits = ImageConfig::default();
         let reranker = Reranker::new(args.method.rerank.config());
         let painter = Painter { extractor: &measured.extractor, limits: &limits, reranker: &reranker };
-        details += &gallery(&painter, &dataset, &measured.answers, args.output.pictures)?;
-        write(path, &report::html(&measured.summary, &dataset, &measured.answers, &details))?;
+        let Answered { answers, left_out, .. } = &measured.answered;
+        details += &gallery(&painter, &dataset, answers, args.output.pictures)?;
+        write(path, &report::html(&measured.summary, &dataset, answers, left_out, &details))?;
     }
     Ok(())
 }
@@ -210,6 +231,7 @@ impl DataArgs {
             radius_m: self.radius,
             max_angle_deg: self.max_angle,
             frame_tolerance: self.frame_tolerance,
+            swap: self.swap,
             ..self.reading.options()
         };
         let dataset = match (&self.database, &self.queries, &self.ground_truth, self.dataset, &self.root) {
@@ -244,8 +266,16 @@ impl RerankArgs {
 
 struct Measured {
     extractor: Extractor,
-    answers: Vec<Answer>,
+    answered: Answered,
     summary: Summary,
+}
+
+/// The answers to a data set.
+struct Answered {
+    answers: Vec<Answer>,
+    /// Those to the same queries with their own place left out of the database, if they were asked so too.
+    left_out: Vec<Answer>,
+    seconds: QuerySeconds,
 }
 
 fn describer(model: &ModelOptions, config: &ExtractConfig) -> anyhow::Result<ModelDescriber> {
@@ -280,6 +310,33 @@ impl Described {
         Ok(Self { extractor: describer.extractor, cache, database, queries })
     }
 
+    /// Answers every query as the service would, and where `own` says so a second time without its own place. Nothing
+    /// is re-ranked without a configuration.
+    fn answer(
+        &self,
+        dataset: &Dataset,
+        own: Option<&OwnPlaces>,
+        candidates: usize,
+        config: Option<&RerankConfig>,
+    ) -> anyhow::Result<Answered> {
+        let wanted = |query| own.map_or(candidates, |own| own.widened(query, candidates));
+        let (mut answers, search) = search_all(&self.database, &self.queries, wanted);
+        if let Some(own) = own {
+            eprintln!("each query is also asked with its own place left out of the database");
+            answers.iter_mut().for_each(|answer| own.trim(answer, candidates));
+        }
+        let (answers, seconds) = match config {
+            None => (answers, QuerySeconds::default()),
+            Some(config) => self.rerank(answers, config)?,
+        };
+        let seconds = QuerySeconds { search, ..seconds };
+        let (answers, left_out) = match own {
+            None => (answers, Vec::new()),
+            Some(own) => own.part_all(dataset, &answers, candidates),
+        };
+        Ok(Answered { answers, left_out, seconds })
+    }
+
     fn rerank(&self, answers: Vec<Answer>, config: &RerankConfig) -> anyhow::Result<(Vec<Answer>, QuerySeconds)> {
         let bar = bar(answers.len() as u64, "re-ranking");
         let patches = |features: &Features, index| self.cache.patches(features, index);
@@ -290,31 +347,62 @@ impl Described {
 }
 
 fn measure(args: &MeasureArgs, dataset: &Dataset, extract: &ExtractConfig) -> anyhow::Result<Measured> {
+    let given = args.method.calibration.as_deref().map(read_calibration).transpose()?;
     let described = Described::new(&args.model, extract, &args.output.cache, dataset, args.method.global)?;
     let candidates = args.method.rerank.candidates;
-    let (answers, search) = search_all(&described.database, &described.queries, |_| candidates);
-    let (answers, seconds) = match args.method.no_rerank {
-        true => (answers, QuerySeconds::default()),
-        false => described.rerank(answers, &args.method.rerank.config())?,
-    };
-    let seconds = QuerySeconds { search, ..seconds };
+    let rerank = (!args.method.no_rerank).then(|| args.method.rerank.config());
+    if let Some(given) = &given {
+        check_calibration(given, args.method.global, described.extractor.model_id(), rerank.as_ref())?;
+    }
+    let own = args.method.leave_out.then(|| OwnPlaces::of(dataset, LeaveOut::Always, args.data.radius)).flatten();
+    let answered = described.answer(dataset, own.as_ref(), candidates, rerank.as_ref())?;
     let config = RunConfig {
         model: described.extractor.model_id().clone(),
         global: args.method.global,
         candidates,
         extract: described.extractor.config().clone(),
-        rerank: (!args.method.no_rerank).then(|| args.method.rerank.config()),
+        rerank,
         bootstrap: args.method.bootstrap,
         seed: args.method.seed,
     };
     let Described { extractor, database, queries, .. } = described;
-    let summary = summarise(dataset, &database, &queries, &answers, seconds, config)?;
-    Ok(Measured { extractor, answers, summary })
+    let asked = Asked { answers: &answered.answers, left_out: &answered.left_out, seconds: answered.seconds };
+    let summary = summarise(dataset, &database, &queries, asked, config, given.as_ref())?;
+    Ok(Measured { extractor, answered, summary })
+}
+
+fn read_calibration(path: &Path) -> anyhow::Result<Calibration> {
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    serde_json::from_str(&text).with_context(|| format!("{} is no calibration", path.display()))
+}
+
+/// Confidences mean something only for the model and the re-ranking they were fitted on.
+fn check_calibration(
+    given: &Calibration,
+    global: GlobalKind,
+    model: &ModelId,
+    rerank: Option<&RerankConfig>,
+) -> anyhow::Result<()> {
+    ensure!(global == GlobalKind::Head, "a calibration holds for distances of the head: leave --global out");
+    ensure!(given.model() == model, "the calibration is one of {}, and this model is {model}", given.model());
+    if let Some(rerank) = rerank {
+        let id = rerank.id();
+        ensure!(given.rerank() == &id, "the calibration is one of re-ranking {}, and this is {id}", given.rerank());
+    }
+    Ok(())
 }
 
 fn write_predictions(path: &Path, args: &MeasureArgs, dataset: &Dataset, answers: &[Answer]) -> anyhow::Result<()> {
     match args.data.dataset {
-        Some(DatasetKind::MslsTest | DatasetKind::MslsVal) => prediction::write_msls(path, dataset, answers)?,
+        Some(DatasetKind::MslsTest | DatasetKind::MslsVal) => {
+            let unanswered = prediction::write_msls(path, dataset, answers)?;
+            if unanswered > 0 {
+                eprintln!(
+                    "warning: {unanswered} of the queries could not be answered; their lines name references that mean \
+                     nothing, because the official evaluation wants a line for every query"
+                );
+            }
+        }
         Some(DatasetKind::RobotcarSeasonsV2) => prediction::write_robotcar(path, dataset, answers)?,
         _ => bail!("only MSLS and RobotCar Seasons have a prediction file"),
     }

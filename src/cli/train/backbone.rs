@@ -4,7 +4,7 @@ use super::head::{Source, fit};
 use super::{RunArgs, bar, facts, finish, notes, show};
 use crate::extract::{Aggregate, ExtractConfig, Extractor, Head, HeadChoice, VitWeights};
 use crate::image::ImageConfig;
-use crate::train::{Augmentation, BackboneModel, Session, TrainError, TrainableBlocks, TripletSet};
+use crate::train::{Augmentation, BackboneModel, Progress, Session, TrainError, TrainableBlocks, TripletSet};
 use anyhow::ensure;
 
 pub(super) fn train(args: &RunArgs, blocks: TrainableBlocks, augmentation: Augmentation) -> anyhow::Result<()> {
@@ -31,7 +31,7 @@ pub(super) fn train(args: &RunArgs, blocks: TrainableBlocks, augmentation: Augme
         sides.validation.fingerprint()
     );
     let bar = bar(&config)?;
-    let mut progress = |record: &_| show(&bar, record);
+    let mut progress = |progress: Progress<'_>| show(&bar, progress);
     let session = Session { folder: args.out.clone(), identity, progress: &mut progress };
     let outcome = model.train(&sides.training, &sides.validation, &config, session)?;
     bar.finish_and_clear();

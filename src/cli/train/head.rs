@@ -2,7 +2,7 @@
 
 use super::{HeadTrainArgs, RunArgs, bar, facts, finish, notes, show};
 use crate::extract::{Covariance, Extractor, Head, HeadChoice, half_whitened_head_of_few};
-use crate::train::{Augmentation, HeadModel, PooledCache, PooledTokens, Session, Side, TripletSet};
+use crate::train::{Augmentation, HeadModel, PooledCache, PooledTokens, Progress, Session, Side, TripletSet};
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -37,7 +37,7 @@ pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
     ]
     .join(" ");
     let bar = bar(&config)?;
-    let mut progress = |record: &_| show(&bar, record);
+    let mut progress = |progress: Progress<'_>| show(&bar, progress);
     let session = Session { folder: args.out.clone(), identity, progress: &mut progress };
     let outcome = model.train(&sides.training, &sides.validation, &config, session)?;
     bar.finish_and_clear();

@@ -8,7 +8,7 @@ mod data;
 mod head;
 
 use super::model_args::ModelOptions;
-use crate::train::{Augmentation, CycleRecord, Outcome, Schedule, TrainConfig, TrainableBlocks, read_log, report};
+use crate::train::{Augmentation, Outcome, Progress, Schedule, TrainConfig, TrainableBlocks, read_log, report};
 use anyhow::{Context, ensure};
 use clap::Args;
 use data::TrainData;
@@ -19,8 +19,16 @@ use std::str::FromStr;
 
 pub(super) use head::train_head;
 
+const EXAMPLES: &str = "Examples: the paper's order, first MSLS, then Pitts30k from where that ended
+  placeformer train --trainable last-2 --dataset msls-val --root /data/msls --out first \\
+      --validation-dataset msls-val --validation-root /data/msls
+  placeformer train --trainable last-2 --dataset pitts30k --root /data/pitts30k --out second \\
+      --validation-dataset pitts30k --validation-root /data/pitts30k \\
+      --weights first/weights.safetensors --head first/head.safetensors";
+
 /// Arguments of this subcommand.
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct TrainArgs {
     /// What moves: the head alone (minutes on a CPU), the last N computed blocks and the head (last-N), or all.
     /// Blocks need three images a triplet in memory: lower --batch where that does not fit.
@@ -191,15 +199,27 @@ impl RunArgs {
     }
 }
 
-/// The bar of a run, and what it says after a cycle.
+/// The bar of a run: steps, and what is known since the last cycle.
 fn bar(config: &TrainConfig) -> anyhow::Result<ProgressBar> {
-    let style = ProgressStyle::with_template("training {wide_bar} {pos}/{len} steps {eta} {msg}")?;
+    let style = ProgressStyle::with_template("training {wide_bar} {pos}/{len} steps {eta} {prefix} {msg}")?;
     Ok(ProgressBar::new(config.schedule.total).with_style(style))
 }
 
-fn show(bar: &ProgressBar, record: &CycleRecord) {
-    bar.set_position(record.step);
-    bar.set_message(format!("loss {:.4}, R@1 {:.1}, R@10 {:.1}", record.loss, record.recall.at_1, record.recall.at_10));
+fn show(bar: &ProgressBar, progress: Progress<'_>) {
+    match progress {
+        Progress::Described { purpose, done, of } => bar.set_prefix(format!("{purpose} {done}/{of} images")),
+        Progress::Step { steps, loss } => {
+            bar.set_prefix(format!("loss {loss:.4}"));
+            bar.set_position(steps);
+        }
+        Progress::Cycle(record) => {
+            bar.set_position(record.step);
+            bar.set_message(format!(
+                "mean loss {:.4}, R@1 {:.1}, R@10 {:.1}",
+                record.loss, record.recall.at_1, record.recall.at_10
+            ));
+        }
+    }
 }
 
 /// What a report and a head's notes say about a run.

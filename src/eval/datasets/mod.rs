@@ -14,6 +14,7 @@ mod robotcar;
 mod table;
 mod utm;
 mod utm_name;
+mod zones;
 
 pub use files::{list_images, relative_name};
 pub use neighbours::NeighbourGrid;
@@ -193,6 +194,8 @@ pub struct DatasetOptions {
     pub frame_tolerance: u64,
     /// Only these cities (MSLS); empty means the split's own.
     pub cities: Vec<String>,
+    /// Exchange the two seasons: winter as the database, summer as the queries (Nordland).
+    pub swap: bool,
     /// The column of `subtask_index.csv` (MSLS): all, s2w, w2s, o2n, n2o, d2n, n2d.
     pub subtask: String,
 }
@@ -204,6 +207,7 @@ impl Default for DatasetOptions {
             radius_m: 25.0,
             max_angle_deg: None,
             frame_tolerance: 10,
+            swap: false,
             cities: Vec::new(),
             subtask: "all".into(),
         }

@@ -2,7 +2,8 @@
 //! with `images/`, `raw.csv`, `postprocessed.csv`, `seq_info.csv` and `subtask_index.csv`.
 //!
 //! Rows are joined by image key, never by line: the files need not be aligned. Panoramas are left out, as in the
-//! official evaluation. The 40-degree view-angle rule (paper IV) uses the compass angle `ca` of `raw.csv`; the
+//! official evaluation. Subtasks choose among the images of the validation and test cities; training takes all, as the
+//! official code does, and needs no `subtask_index.csv`. The 40-degree view-angle rule (paper IV) uses the compass angle `ca` of `raw.csv`; the
 //! official image-to-image script for the validation cities measures the distance only (give 180 for that).
 
 use super::files::{list_images, require};
@@ -10,6 +11,7 @@ use super::neighbours::truth_by_distance;
 use super::table::Table;
 use super::{Dataset, DatasetOptions, Item, MetricPoint, Skipped, Split, Truth, utm};
 use crate::eval::EvalError;
+use std::collections::hash_map::Entry;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
@@ -24,12 +26,12 @@ pub(super) fn load_labelled(root: &Path, options: &DatasetOptions) -> Result<Dat
     let name = "msls-val";
     let angle = options.max_angle_deg.unwrap_or(VIEW_ANGLE_DEG);
     let split = options.split.unwrap_or(Split::Val);
-    if !root.join("train_val").exists() && root.join("images").join(split.as_str()).exists() {
+    if !root.join("train_val").exists() && utm::find_split(root, split).is_some() {
         let options = DatasetOptions { max_angle_deg: Some(angle), split: Some(split), ..options.clone() };
         return utm::load(name, root, &options);
     }
     let folder = require(name, root.join("train_val"), EXPECTED)?;
-    let mut reader = Reader { subtask: &options.subtask, skipped: Vec::new(), without_angle: 0 };
+    let mut reader = Reader { subtask: &options.subtask, split, skipped: Vec::new(), without_angle: 0 };
     let (mut database, mut queries) = (Vec::new(), Vec::new());
     for city in cities(&folder, split, options)? {
         database.extend(reader.labelled_side(name, &folder, &city, "database")?);
@@ -37,6 +39,9 @@ pub(super) fn load_labelled(root: &Path, options: &DatasetOptions) -> Result<Dat
     }
     let truth = truth_by_distance(&database, &queries, options.radius_m, Some(angle));
     let mut notes = vec![format!("positives lie within {} m and {angle} degrees of view angle", options.radius_m)];
+    if split == Split::Train && options.subtask != DatasetOptions::default().subtask {
+        notes.push(format!("subtask {:?} chooses among validation images only; training takes all", options.subtask));
+    }
     if reader.without_angle > 0 {
         notes.push(format!("{} images have no compass angle; for them only the distance counts", reader.without_angle));
     }
@@ -47,7 +52,7 @@ pub(super) fn load_labelled(root: &Path, options: &DatasetOptions) -> Result<Dat
 pub(super) fn load_test(root: &Path, options: &DatasetOptions) -> Result<Dataset, EvalError> {
     let name = "msls-test";
     let folder = require(name, root.join("test"), EXPECTED_TEST)?;
-    let mut reader = Reader { subtask: &options.subtask, skipped: Vec::new(), without_angle: 0 };
+    let mut reader = Reader { subtask: &options.subtask, split: Split::Test, skipped: Vec::new(), without_angle: 0 };
     let (mut database, mut queries) = (Vec::new(), Vec::new());
     for city in cities(&folder, Split::Test, options)? {
         database.extend(reader.test_side(name, &folder, &city, "database")?);
@@ -82,6 +87,7 @@ fn cities(folder: &Path, split: Split, options: &DatasetOptions) -> Result<Vec<S
 
 struct Reader<'a> {
     subtask: &'a str,
+    split: Split,
     skipped: Vec<Skipped>,
     without_angle: usize,
 }
@@ -99,13 +105,18 @@ impl Reader<'_> {
         side: &str,
     ) -> Result<Vec<Item>, EvalError> {
         let folder = require(dataset, root.join(city).join(side), EXPECTED)?;
-        let raw = read_raw(&require(dataset, folder.join("raw.csv"), EXPECTED)?)?;
+        let raw = self.raw_rows(&require(dataset, folder.join("raw.csv"), EXPECTED)?, city, side)?;
         let positions = self.positions(&require(dataset, folder.join("postprocessed.csv"), EXPECTED)?, city, side)?;
-        let subtask = self.subtask_keys(&require(dataset, folder.join("subtask_index.csv"), EXPECTED)?)?;
+        let subtask = match self.split {
+            Split::Train => None,
+            Split::Val | Split::Test => {
+                Some(self.subtask_keys(&require(dataset, folder.join("subtask_index.csv"), EXPECTED)?)?)
+            }
+        };
         self.report_images_without_rows(&folder, city, side, &positions)?;
         let mut items = Vec::new();
         for (key, position) in &positions {
-            if !subtask.contains(key.as_str()) {
+            if subtask.as_ref().is_some_and(|keys| !keys.contains(key.as_str())) {
                 continue;
             }
             match raw.get(key) {
@@ -163,6 +174,26 @@ impl Reader<'_> {
         Ok(positions)
     }
 
+    fn raw_rows(&mut self, path: &Path, city: &str, side: &str) -> Result<HashMap<String, RawRow>, EvalError> {
+        let table = Table::read(path)?;
+        let (key, pano) = (table.column("key")?, table.column("pano")?);
+        let angle = table.optional_column("ca");
+        let mut rows = HashMap::new();
+        for row in table.rows() {
+            // Some cities lack the angle of some images: an empty field, or NaN.
+            let angle = angle.and_then(|column| row.text(column).parse::<f64>().ok()).filter(|angle| angle.is_finite());
+            let name = row.text(key);
+            // The first row counts, as in postprocessed.csv.
+            match rows.entry(name.to_owned()) {
+                Entry::Occupied(_) => self.skip(city, side, name, "a second row with this key in raw.csv"),
+                Entry::Vacant(place) => {
+                    place.insert(RawRow { angle, panorama: row.flag(pano)? });
+                }
+            }
+        }
+        Ok(rows)
+    }
+
     fn subtask_keys(&self, path: &Path) -> Result<HashSet<String>, EvalError> {
         let table = Table::read(path)?;
         let (key, subtask) = (table.column("key")?, table.column(self.subtask)?);
@@ -201,19 +232,6 @@ fn image_item(folder: &Path, city: &str, side: &str, key: &str) -> Item {
 struct RawRow {
     angle: Option<f64>,
     panorama: bool,
-}
-
-fn read_raw(path: &Path) -> Result<HashMap<String, RawRow>, EvalError> {
-    let table = Table::read(path)?;
-    let (key, pano) = (table.column("key")?, table.column("pano")?);
-    let angle = table.optional_column("ca");
-    let mut rows = HashMap::new();
-    for row in table.rows() {
-        // Some cities lack the angle of some images: an empty field, or NaN.
-        let angle = angle.and_then(|column| row.text(column).parse::<f64>().ok()).filter(|angle| angle.is_finite());
-        rows.insert(row.text(key).to_owned(), RawRow { angle, panorama: row.flag(pano)? });
-    }
-    Ok(rows)
 }
 
 #[cfg(test)]
@@ -295,6 +313,65 @@ mod tests {
         assert_eq!((dataset.database.len(), dataset.queries.len()), (2, 1));
         let options = DatasetOptions { subtask: "dawn".into(), ..Default::default() };
         assert!(load(DatasetKind::MslsVal, root.path(), &options).unwrap_err().to_string().contains("dawn"));
+    }
+
+    #[test]
+    fn a_subtask_chooses_validation_images_but_never_training_images() {
+        let root = sample();
+        let index = root.path().join("train_val/cph/query/subtask_index.csv");
+        let load = |split| {
+            let cities = vec!["cph".into()];
+            let options = DatasetOptions { subtask: "s2w".into(), cities, split: Some(split), ..Default::default() };
+            load(DatasetKind::MslsVal, root.path(), &options)
+        };
+        assert_eq!(load(Split::Val).unwrap().queries.len(), 1);
+        let training = load(Split::Train).unwrap();
+        assert_eq!((training.database.len(), training.queries.len()), (4, 2));
+        assert!(training.notes.iter().any(|note| note.contains("s2w")), "{:?}", training.notes);
+        std::fs::remove_file(&index).unwrap();
+        assert_eq!(load(Split::Train).unwrap(), training);
+        assert!(load(Split::Val).unwrap_err().to_string().contains("subtask_index.csv"));
+    }
+
+    #[test]
+    fn rows_are_joined_by_key_and_second_rows_are_reported() {
+        let root = sample();
+        let folder = root.path().join("train_val/cph/database");
+        // Another order than postprocessed.csv; d0 twice with another angle, d1 not at all.
+        let raw = ",key,lon,lat,ca,captured_at,pano\n0,d5,1,1,10,x,False\n1,d4,1,1,,x,False\n2,d0,1,1,10,x,False\n\
+                   3,d0,1,1,200,x,False\n4,d2,1,1,10,x,True\n";
+        std::fs::write(folder.join("raw.csv"), raw).unwrap();
+        // d0 a second time, far away.
+        let path = folder.join("postprocessed.csv");
+        let rows = std::fs::read_to_string(&path).unwrap() + "9,d0,5000,0,False,False,Forward,0\r\n";
+        std::fs::write(&path, rows).unwrap();
+        let options = DatasetOptions { cities: vec!["cph".into()], ..Default::default() };
+        let dataset = load(DatasetKind::MslsVal, root.path(), &options).unwrap();
+        let known: Vec<_> = dataset
+            .database
+            .iter()
+            .map(|item| (item.name.as_str(), item.position.unwrap().east, item.heading))
+            .collect();
+        let expected = [
+            ("cph/database/d0", 0.0, Some(10.0)),
+            ("cph/database/d4", 7.0, None),
+            ("cph/database/d5", 900.0, Some(10.0)),
+        ];
+        assert_eq!(known, expected);
+        let mut reasons: Vec<_> = dataset
+            .skipped
+            .iter()
+            .filter_map(|skipped| Some((skipped.name.strip_prefix("cph/database/")?, skipped.reason.as_str())))
+            .collect();
+        reasons.sort_unstable();
+        let expected = [
+            ("d0", "a second row with this key in postprocessed.csv"),
+            ("d0", "a second row with this key in raw.csv"),
+            ("d1", "no row in raw.csv"),
+            ("d2", "panorama"),
+            ("d3", "no row in postprocessed.csv"),
+        ];
+        assert_eq!(reasons, expected);
     }
 
     #[test]

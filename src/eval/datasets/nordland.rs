@@ -2,25 +2,37 @@
 //!
 //! Two layouts: the downloader's (`images/test/{database,queries}`, the frame in the seventh field of an
 //! `@utm_east@utm_north@...` name) and the films' own folders (`summer/` and `winter/`, the frame at the end of the
-//! name, such as `images-00042.png`).
+//! name, such as `images-00042.png`). Where `cleanImageNames.txt` lies beside them, only the frames it lists take part:
+//! the usual evaluation leaves tunnels and stations out.
 
 use super::files::{list_images, require};
+use super::utm::find_split;
 use super::utm_name::UtmName;
 use super::{Dataset, DatasetOptions, Item, Skipped, Split, Truth};
 use crate::eval::EvalError;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 const NAME: &str = "nordland";
+/// Names of the frames that take part, one a line.
+const CLEAN: &str = "cleanImageNames.txt";
 const EXPECTED: &str = "images/test/{database,queries}, or summer/ (database) and winter/ (queries)";
 
 /// Reads both sides and matches them by frame.
 pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, EvalError> {
-    let (database_dir, queries_dir) = folders(root, options.split.unwrap_or(Split::Test))?;
+    let (mut database_dir, mut queries_dir) = folders(root, options.split.unwrap_or(Split::Test))?;
+    if options.swap {
+        std::mem::swap(&mut database_dir, &mut queries_dir);
+    }
+    let clean = clean_frames(root)?;
     let mut skipped = Vec::new();
     let mut read = |folder: &Path| -> Result<(Vec<Item>, Vec<u64>), EvalError> {
         let (mut items, mut frames) = (Vec::new(), Vec::new());
         for (name, path) in list_images(folder)? {
             match frame_of(&name) {
+                Some(frame) if clean.as_ref().is_some_and(|clean| !clean.contains(&frame)) => {
+                    skipped.push(Skipped { name, reason: format!("not in {CLEAN}") });
+                }
                 Some(frame) => {
                     items.push(Item::new(name, path));
                     frames.push(frame);
@@ -35,8 +47,31 @@ pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, Eva
     let mut by_frame: Vec<(u64, usize)> = database_frames.iter().enumerate().map(|(i, &frame)| (frame, i)).collect();
     by_frame.sort_unstable();
     let truth = query_frames.iter().map(|&frame| truth_of(frame, options.frame_tolerance, &by_frame)).collect();
-    let notes = vec![format!("positives lie within {} frames", options.frame_tolerance)];
+    let mut notes = vec![format!("positives lie within {} frames", options.frame_tolerance)];
+    if let Some(clean) = clean {
+        notes.push(format!("only the {} frames of {CLEAN} take part", clean.len()));
+    }
+    if options.swap {
+        notes.push("the seasons are exchanged: what is usually asked is searched".into());
+    }
     Ok(Dataset { name: NAME.into(), database, queries, truth, skipped, notes })
+}
+
+/// The frames that take part, if the data set says so.
+fn clean_frames(root: &Path) -> Result<Option<BTreeSet<u64>>, EvalError> {
+    let path = root.join(CLEAN);
+    let text = match std::fs::read_to_string(&path) {
+        Ok(text) => text,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(EvalError::io(&path)(error)),
+    };
+    let mut frames = BTreeSet::new();
+    for (line, name) in (1..).zip(text.lines().map(str::trim)).filter(|(_, name)| !name.is_empty()) {
+        let reason = || format!("{name:?} has no frame number");
+        let frame = frame_of(name).ok_or_else(|| EvalError::Record { path: path.clone(), line, reason: reason() })?;
+        frames.insert(frame);
+    }
+    Ok(Some(frames))
 }
 
 fn folders(root: &Path, split: Split) -> Result<(PathBuf, PathBuf), EvalError> {
@@ -44,7 +79,8 @@ fn folders(root: &Path, split: Split) -> Result<(PathBuf, PathBuf), EvalError> {
     if films.0.exists() && films.1.exists() {
         return Ok(films);
     }
-    let folder = require(NAME, root.join("images").join(split.as_str()), EXPECTED)?;
+    let nested = || root.join("images").join(split.as_str());
+    let folder = require(NAME, find_split(root, split).unwrap_or_else(nested), EXPECTED)?;
     Ok((require(NAME, folder.join("database"), EXPECTED)?, require(NAME, folder.join("queries"), EXPECTED)?))
 }
 
@@ -109,5 +145,28 @@ mod tests {
         let dataset = load_dataset(DatasetKind::Nordland, root.path(), &options).unwrap();
         assert_eq!(dataset.truth[0], Truth::Positives(vec![0, 1]));
         assert_eq!(dataset.truth[17], Truth::Positives(vec![16, 17, 18]));
+    }
+
+    #[test]
+    fn only_clean_frames_take_part_and_the_seasons_can_be_exchanged() {
+        let root = tempfile::tempdir().unwrap();
+        write(root.path(), &(0..8).map(|i| format!("summer/images-{i:05}.png")).collect::<Vec<_>>());
+        write(root.path(), &(0..6).map(|i| format!("winter/images-{i:05}.png")).collect::<Vec<_>>());
+        let options = |swap| DatasetOptions { frame_tolerance: 1, swap, ..Default::default() };
+        let load = |swap| load_dataset(DatasetKind::Nordland, root.path(), &options(swap));
+        let sides = |dataset: &Dataset| (dataset.database.len(), dataset.queries.len());
+        assert_eq!(sides(&load(false).unwrap()), (8, 6));
+        assert_eq!(sides(&load(true).unwrap()), (6, 8));
+        let list = root.path().join(CLEAN);
+        std::fs::write(&list, "images-00000.png\r\nimages-00003.png\r\nimages-00004.png\r\nimages-00007.png\r\n")
+            .unwrap();
+        let clean = load(false).unwrap();
+        assert_eq!((sides(&clean), clean.skipped.len()), ((4, 3), 4 + 3));
+        assert_eq!(clean.truth[0], Truth::Positives(vec![0]));
+        assert_eq!(clean.truth[1], Truth::Positives(vec![1, 2]));
+        let swapped = load(true).unwrap();
+        assert_eq!(swapped.truth[3], Truth::NoMatch);
+        std::fs::write(&list, "images-00000.png\ntunnel.png\n").unwrap();
+        assert!(load(false).unwrap_err().to_string().contains("line 2: \"tunnel.png\""));
     }
 }

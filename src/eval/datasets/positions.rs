@@ -1,9 +1,11 @@
 //! Positions beside images that have none in their names: `positions.csv` with `file`, `lat`, `lon`, `heading`.
 //!
 //! The table `import` takes. `file` is the path below the table's folder, so that both sides of a data set find their
-//! rows in one table. Positions become metres in the UTM zone of the first row.
+//! rows in one table. Positions become metres in the plane of their UTM zones; regions far apart become groups, see
+//! `zones`.
 
 use super::table::{Column, Row, Table};
+use super::zones::Zones;
 use super::{Item, UtmZone, relative_name};
 use crate::eval::EvalError;
 use crate::types::GeoPoint;
@@ -20,28 +22,24 @@ pub(super) fn locate(folder: &Path, sides: [&mut [Item]; 2]) -> Result<(), EvalE
     let (Some(lat), Some(lon)) = (table.optional_column("lat"), table.optional_column("lon")) else { return Ok(()) };
     let (file, heading) = (table.column("file")?, table.optional_column("heading"));
     let mut rows = HashMap::new();
-    let mut zone = None;
     for row in table.rows() {
-        let point = match point(row, lat, lon)? {
+        let beyond = || row.error("beyond 80 degrees south or 84 north there is no UTM zone".into());
+        let place = match point(row, lat, lon)? {
             None => None,
-            Some(geo) => {
-                let beyond = || row.error("beyond 80 degrees south or 84 north there is no UTM zone".into());
-                let zone = match zone {
-                    Some(zone) => zone,
-                    None => *zone.insert(UtmZone::of(geo).ok_or_else(beyond)?),
-                };
-                Some(zone.from_geo(geo))
-            }
+            Some(geo) => Some((UtmZone::of(geo).ok_or_else(beyond)?, geo)),
         };
         let heading = match heading.filter(|&column| !row.text(column).is_empty()) {
             Some(column) => Some(row.number(column)?),
             None => None,
         };
-        rows.insert(row.text(file).replace('\\', "/"), (point, heading));
+        rows.insert(row.text(file).replace('\\', "/"), (place, heading));
     }
+    let zones = Zones::of(rows.values().filter_map(|(place, _)| Some((*place)?.0)));
     for item in sides.into_iter().flatten() {
-        if let Some(&(position, heading)) = rows.get(&relative_name(folder, &item.path)) {
-            (item.position, item.heading) = (position, heading);
+        if let Some(&(place, heading)) = rows.get(&relative_name(folder, &item.path)) {
+            item.position = place.and_then(|(zone, geo)| zones.from_geo(zone, geo));
+            item.group = place.and_then(|(zone, _)| zones.group(zone));
+            item.heading = heading;
         }
     }
     Ok(())
@@ -77,6 +75,17 @@ mod tests {
         let (a, q) = (database[0].position.unwrap(), queries[0].position.unwrap());
         assert!((q.north - a.north - 11.12).abs() < 0.1 && (q.east - a.east).abs() < 0.5, "{a:?} {q:?}");
         assert_eq!((database[0].heading, database[1].heading, database[1].position), (Some(90.0), Some(10.0), None));
+    }
+
+    #[test]
+    fn far_regions_become_groups() {
+        // San Francisco and Copenhagen; both sides of the latter 20 m apart.
+        let csv =
+            "file,lat,lon\ndatabase/a.jpg,37.77,-122.42\ndatabase/b.jpg,55.67,12.57\nqueries/a.jpg,55.67018,12.57\n";
+        let [database, queries] = located(csv).unwrap();
+        assert!(database[1].group == queries[0].group && database[0].group != queries[0].group);
+        let (b, q) = (database[1].position.unwrap(), queries[0].position.unwrap());
+        assert!(((b.east - q.east).hypot(b.north - q.north) - 20.0).abs() < 0.2, "{b:?} {q:?}");
     }
 
     #[test]

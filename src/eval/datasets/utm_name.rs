@@ -42,13 +42,24 @@ impl UtmZone {
 
     /// The position of grid coordinates in this zone.
     pub fn to_geo(self, point: MetricPoint) -> Option<GeoPoint> {
-        let (lat, lon) = utm::wsg84_utm_to_lat_lon(point.east, point.north, self.number, self.band).ok()?;
-        GeoPoint::new(lat, lon).ok()
+        let inverse = |east, north| {
+            let (lat, lon) = utm::wsg84_utm_to_lat_lon(east, north, self.number, self.band).ok()?;
+            GeoPoint::new(lat, lon).ok()
+        };
+        let near = inverse(point.east, point.north)?;
+        // The library's inverse is off by up to 0.6 m at the edge of a zone, where neighbours of two zones meet. Its
+        // forward direction is exact, so one step back from where that lands leaves less than a millimetre.
+        let landed = self.from_geo(near);
+        let (east, north) = (2.0 * point.east - landed.east, 2.0 * point.north - landed.north);
+        Some(inverse(east, north).unwrap_or(near))
     }
 
     /// The grid coordinates of a position, continued into this zone wherever it lies.
     pub fn from_geo(self, position: GeoPoint) -> MetricPoint {
-        let (north, east, _) = utm::to_utm_wgs84(position.lat(), position.lon(), self.number);
+        // Measured from the zone's own meridian, so that the date line does not tear neighbours apart.
+        let meridian = f64::from(self.number) * 6.0 - 183.0;
+        let lon = meridian + (position.lon() - meridian + 180.0).rem_euclid(360.0) - 180.0;
+        let (north, east, _) = utm::to_utm_wgs84(position.lat(), lon, self.number);
         MetricPoint { east, north }
     }
 }
@@ -155,7 +166,10 @@ mod tests {
         let zone: UtmZone = "54S".parse().unwrap();
         let tokyo = GeoPoint::new(35.6586, 139.7454).unwrap();
         let there = zone.from_geo(tokyo);
-        assert!(zone.to_geo(there).unwrap().distance_m(tokyo) < 0.1);
+        assert!(zone.to_geo(there).unwrap().distance_m(tokyo) < 0.01);
+        // At the edge of a zone too.
+        let edge = GeoPoint::new(36.0, 143.9999).unwrap();
+        assert!(zone.to_geo(zone.from_geo(edge)).unwrap().distance_m(edge) < 0.01);
         for bad in ["", "T", "61T", "33I", "0N", "33"] {
             assert!(bad.parse::<UtmZone>().is_err(), "{bad}");
         }

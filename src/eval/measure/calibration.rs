@@ -4,22 +4,23 @@
 //! that separable data do not send the weights to infinity. A slope of the wrong sign (fewer inliers making an answer
 //! surer) is an accident of few data: it is held at zero. How well the curve holds is told by the expected calibration
 //! error: queries are put into ten bins of confidence, and the mean confidence is compared with the share of right
-//! answers. What is told about unseen queries comes from cross-validation, which keeps the answers to one query
-//! together.
+//! answers. What is told about unseen queries comes from cross-validation by place: neighbouring frames of one street
+//! are nearly the same photo, so a fit that has seen one has seen the other. The threshold is judged the same way, on
+//! places that had no say in choosing it; chosen and judged on the same answers, it would keep its promise by
+//! construction.
 
+use super::folds::folds_of;
 use crate::types::{ConfidenceCurve, ConfidenceWeights};
 use nalgebra::{Matrix3, Vector3};
-use rand::SeedableRng;
-use rand::seq::SliceRandom;
-use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 
 /// A query's best answer with what is known about it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TopOne {
-    /// The query; answers to the same one (with and without its place in the database) share it.
-    pub query: usize,
+    /// The place asked about: answers to one query (with and without its place in the database) share it, and so do
+    /// queries that show the same place.
+    pub place: usize,
     /// S of the best answer; `None` if it was not re-ranked.
     pub spatial_score: Option<f64>,
     /// Its Euclidean distance.
@@ -137,28 +138,89 @@ pub fn predict(weights: &ConfidenceWeights, answers: &[TopOne]) -> Vec<Predictio
     answers.iter().map(one).collect()
 }
 
-/// Confidence of every answer from a fit that has not seen its query. Queries answered alike (only right, only wrong,
-/// both) are dealt evenly to the folds; a fold whose others are one-sided is left out.
-pub fn cross_validate(answers: &[TopOne], ridge: f64, folds: usize, seed: u64) -> Vec<Prediction> {
-    let mut kinds: BTreeMap<usize, (bool, bool)> = BTreeMap::new();
-    for answer in answers {
-        let kind = kinds.entry(answer.query).or_default();
-        *kind = (kind.0 | answer.correct, kind.1 | !answer.correct);
-    }
-    let mut queries: Vec<(usize, (bool, bool))> = kinds.into_iter().collect();
-    queries.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
-    queries.sort_by_key(|&(_, kind)| kind);
-    let folds = folds.max(2);
-    let fold_of: BTreeMap<usize, usize> =
-        queries.into_iter().enumerate().map(|(place, (query, _))| (query, place % folds)).collect();
-    let mut predictions = Vec::new();
-    for fold in 0..folds {
-        let (own, others): (Vec<TopOne>, Vec<TopOne>) =
-            answers.iter().partition(|answer| fold_of.get(&answer.query) == Some(&fold));
+/// A prediction by a fit that has not seen its place.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Unseen {
+    /// The part it was left out with.
+    pub fold: usize,
+    /// The place asked about.
+    pub place: usize,
+    /// What the fit to the other parts said.
+    pub prediction: Prediction,
+}
+
+/// Confidence of every answer from a fit that has not seen its place; a fold whose others are one-sided is left out.
+pub fn cross_validate(answers: &[TopOne], ridge: f64, folds: usize, seed: u64) -> Vec<Unseen> {
+    let fold_of = folds_of(answers, folds, seed);
+    let with_fold = || answers.iter().copied().zip(fold_of.iter().copied());
+    let mut unseen = Vec::new();
+    for fold in 0..folds.max(2) {
+        let others: Vec<TopOne> = with_fold().filter(|one| one.1 != fold).map(|one| one.0).collect();
+        let own: Vec<TopOne> = with_fold().filter(|one| one.1 == fold).map(|one| one.0).collect();
         let Ok(fitted) = fit(&others, ridge) else { continue };
-        predictions.extend(predict(&fitted, &own));
+        let predictions = predict(&fitted, &own);
+        unseen.extend(own.iter().zip(predictions).map(|(one, prediction)| Unseen {
+            fold,
+            place: one.place,
+            prediction,
+        }));
     }
-    predictions
+    unseen
+}
+
+/// The predictions alone.
+pub fn predictions_of(unseen: &[Unseen]) -> Vec<Prediction> {
+    unseen.iter().map(|one| one.prediction).collect()
+}
+
+/// How well a threshold keeps its promise on places that had no say in choosing it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ThresholdCheck {
+    /// Answers trusted.
+    pub count: usize,
+    /// Places they show.
+    pub places: usize,
+    /// Share of right ones among them, 0 to 1; 1 if there are none.
+    pub precision: f64,
+    /// 95% interval of the precision (Wilson's, each place counted once, because answers within one go together).
+    pub interval: [f64; 2],
+    /// Right ones among them as a share of the queries that have a match, 0 to 1.
+    pub recall: f64,
+}
+
+/// Chooses a threshold on all folds but one and applies it to that one, in turn.
+pub fn check_threshold(unseen: &[Unseen], target: f64) -> ThresholdCheck {
+    let folds: BTreeSet<usize> = unseen.iter().map(|one| one.fold).collect();
+    let mut trusted: Vec<&Unseen> = Vec::new();
+    for fold in folds {
+        let (own, others): (Vec<&Unseen>, Vec<&Unseen>) = unseen.iter().partition(|one| one.fold == fold);
+        let others: Vec<Prediction> = others.into_iter().map(|one| one.prediction).collect();
+        let threshold = choose_threshold(&others, target).threshold;
+        trusted.extend(own.into_iter().filter(|one| one.prediction.confidence >= threshold));
+    }
+    let right = trusted.iter().filter(|one| one.prediction.correct).count();
+    let with_match = unseen.iter().filter(|one| one.prediction.has_match).count();
+    let places = trusted.iter().map(|one| one.place).collect::<BTreeSet<_>>().len();
+    let precision = if trusted.is_empty() { 1.0 } else { right as f64 / trusted.len() as f64 };
+    ThresholdCheck {
+        count: trusted.len(),
+        places,
+        precision,
+        interval: wilson(precision, places),
+        recall: right as f64 / with_match.max(1) as f64,
+    }
+}
+
+/// Wilson's 95% interval of a share seen in `count` independent trials; everything is possible without any.
+fn wilson(share: f64, count: usize) -> [f64; 2] {
+    const Z: f64 = 1.959_963_984_540_054;
+    if count == 0 {
+        return [0.0, 1.0];
+    }
+    let (n, z2) = (count as f64, Z * Z);
+    let centre = (share + z2 / (2.0 * n)) / (1.0 + z2 / n);
+    let half = Z / (1.0 + z2 / n) * (share * (1.0 - share) / n + z2 / (4.0 * n * n)).sqrt();
+    [(centre - half).max(0.0), (centre + half).min(1.0)]
 }
 
 /// Where on a curve trust begins, and what it costs.
@@ -201,28 +263,39 @@ pub fn choose_threshold(predictions: &[Prediction], target: f64) -> Trusted {
     reached.next().unwrap_or_else(|| trusted(predictions, 1.0))
 }
 
-/// A curve with all that is known about it, and its error on the answers it was fitted on.
+/// A curve with all that is known about it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FittedCurve {
+    /// The curve; its precision and recall are those of `check`.
+    pub curve: ConfidenceCurve,
+    /// Calibration error on the answers it was fitted on.
+    pub in_sample_error: f64,
+    /// What its threshold is worth elsewhere.
+    pub check: ThresholdCheck,
+}
+
+/// Fits a curve, and judges it on what it has not seen.
 ///
 /// Weights and shares are rounded to six digits, so that a file shows what is meant.
-pub fn fit_curve(answers: &[TopOne], target: f64, seed: u64) -> Result<(ConfidenceCurve, f64), CalibrationError> {
+pub fn fit_curve(answers: &[TopOne], target: f64, seed: u64) -> Result<FittedCurve, CalibrationError> {
     let raw = fit(answers, RIDGE)?;
     let weights =
         ConfidenceWeights { bias: rounded(raw.bias), score: rounded(raw.score), distance: rounded(raw.distance) };
     let unseen = cross_validate(answers, RIDGE, FOLDS, seed);
-    let at = choose_threshold(&unseen, target);
+    let (predictions, check) = (predictions_of(&unseen), check_threshold(&unseen, target));
     let count = |wanted: fn(&TopOne) -> bool| answers.iter().filter(|answer| wanted(answer)).count() as u64;
     let curve = ConfidenceCurve {
         weights,
-        threshold: rounded(at.threshold),
+        threshold: rounded(choose_threshold(&predictions, target).threshold),
         right: count(|answer| answer.correct),
         wrong: count(|answer| !answer.correct),
         without_match: count(|answer| !answer.has_match),
-        precision: rounded(at.precision),
-        recall: rounded(at.recall),
-        expected_calibration_error: rounded(calibration_error(&reliability(&unseen))),
+        precision: rounded(check.precision),
+        recall: rounded(check.recall),
+        expected_calibration_error: rounded(calibration_error(&reliability(&predictions))),
     };
-    let in_sample = calibration_error(&reliability(&predict(&weights, answers)));
-    Ok((curve, in_sample))
+    let in_sample_error = calibration_error(&reliability(&predict(&weights, answers)));
+    Ok(FittedCurve { curve, in_sample_error, check })
 }
 
 fn rounded(value: f64) -> f64 {

@@ -9,7 +9,7 @@ use crate::eval::evidence::{Seen, picture};
 use crate::eval::measure::first_hit;
 use crate::eval::run::Answer;
 use crate::extract::Extractor;
-use crate::image::{ImageConfig, decode};
+use crate::image::{ImageConfig, RgbImage, decode};
 use crate::rerank::Reranker;
 
 /// What draws the pictures.
@@ -82,9 +82,7 @@ impl Painter<'_> {
         let mut out = format!("<details open><summary>{}</summary>\n", escape(&query.name));
         out += "<h3>Query</h3><div class=\"row\">";
         out += &self.thumbnail(query, "", "query")?;
-        if let Some(&positive) = truth.positives().first() {
-            out += &self.thumbnail(&dataset.database[positive], "right", "a right answer")?;
-        }
+        out += &self.right_answer(dataset, truth)?;
         out += "</div><h3>Nearest by global distance</h3><div class=\"row\">";
         for neighbour in answer.global.iter().take(SHOWN) {
             let caption = format!("distance {:.3}", neighbour.distance);
@@ -108,29 +106,67 @@ impl Painter<'_> {
         Ok(out + "</details>\n")
     }
 
+    /// The first positive that can be read. Images that could not be read took no part, but the truth still names them.
+    fn right_answer(&self, dataset: &Dataset, truth: &Truth) -> Result<String, EvalError> {
+        let mut reasons = Vec::new();
+        for &positive in truth.positives() {
+            let item = &dataset.database[positive];
+            match open(item, self.limits) {
+                Ok(image) => return picture_of(item, &image, "right", "a right answer"),
+                Err(error) => reasons.push(format!("{}: {error}", item.name)),
+            }
+        }
+        let named = reasons.first().map(|first| placeholder("no right answer could be read", first));
+        Ok(named.unwrap_or_default())
+    }
+
     fn thumbnail(&self, item: &Item, class: &str, caption: &str) -> Result<String, EvalError> {
-        let image = decode(&read(item)?, self.limits)?;
-        let uri = jpeg_data_uri(&thumbnail(&image, THUMBNAIL_PX)?, QUALITY)?;
-        let (name, caption) = (escape(&item.name), escape(caption));
-        Ok(format!(
-            "<figure><img class=\"{class}\" loading=\"lazy\" alt=\"{name}\" src=\"{uri}\">\
-             <figcaption>{caption}<br><span class=\"soft\">{name}</span></figcaption></figure>"
-        ))
+        match open(item, self.limits) {
+            Ok(image) => picture_of(item, &image, class, caption),
+            // It was readable when it was described: a long run may outlive its images.
+            Err(error) => Ok(placeholder(caption, &format!("{}: {error}", item.name))),
+        }
     }
 
     fn evidence(&self, query: &Item, reference: &Item) -> Result<String, EvalError> {
-        let see = |item: &Item| Seen::new(self.extractor, self.limits, &read(item)?);
-        let (query_seen, reference_seen) = (see(query)?, see(reference)?);
+        let title = "<h3>What the key patches saw: query left, best answer right</h3>";
+        let (query_bytes, reference_bytes) = match (read(query), read(reference)) {
+            (Ok(query), Ok(reference)) => (query, reference),
+            (Err(error), _) | (_, Err(error)) => {
+                return Ok(title.to_owned() + &placeholder("no longer readable", &error.to_string()));
+            }
+        };
+        let see = |bytes: &[u8]| Seen::new(self.extractor, self.limits, bytes);
+        let (query_seen, reference_seen) = (see(&query_bytes)?, see(&reference_bytes)?);
         let matches = self.reranker.explain(&query_seen.patches, &reference_seen.patches);
         let drawn = picture(&query_seen, &reference_seen, &matches)?;
         let uri = jpeg_data_uri(&thumbnail(&drawn, PICTURE_PX)?, QUALITY)?;
         let alt = escape(&format!("inliers between {} and {}", query.name, reference.name));
         Ok(format!(
-            "<h3>What the key patches saw: query left, best answer right</h3><figure>\
+            "{title}<figure>\
              <img loading=\"lazy\" alt=\"{alt}\" src=\"{uri}\"><figcaption>Attention with the key patches of the three \
              scales, then the inliers of each combination.</figcaption></figure>\n"
         ))
     }
+}
+
+fn picture_of(item: &Item, image: &RgbImage, class: &str, caption: &str) -> Result<String, EvalError> {
+    let uri = jpeg_data_uri(&thumbnail(image, THUMBNAIL_PX)?, QUALITY)?;
+    let (name, caption) = (escape(&item.name), escape(caption));
+    Ok(format!(
+        "<figure><img class=\"{class}\" loading=\"lazy\" alt=\"{name}\" src=\"{uri}\">\
+         <figcaption>{caption}<br><span class=\"soft\">{name}</span></figcaption></figure>"
+    ))
+}
+
+/// What stands where a picture would.
+fn placeholder(caption: &str, reason: &str) -> String {
+    let (caption, reason) = (escape(caption), escape(reason));
+    format!("<figure><figcaption>{caption}<br><span class=\"soft\">{reason}</span></figcaption></figure>")
+}
+
+fn open(item: &Item, limits: &ImageConfig) -> Result<RgbImage, EvalError> {
+    Ok(decode(&read(item)?, limits)?)
 }
 
 fn outline(right: bool) -> &'static str {

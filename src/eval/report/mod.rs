@@ -20,9 +20,9 @@ use super::measure::RECALL_AT;
 use super::run::Answer;
 use super::summary::{AtK, GroupSummary, Summary};
 
-/// The whole page. `details` is HTML that follows the plots: single queries as pictures, an ablation
+/// The whole page. `left_out` are answers that cannot be right, because the query's place was left out. `details` is HTML that follows the plots: single queries as pictures, an ablation
 /// table, or nothing.
-pub fn html(summary: &Summary, dataset: &Dataset, answers: &[Answer], details: &str) -> String {
+pub fn html(summary: &Summary, dataset: &Dataset, answers: &[Answer], left_out: &[Answer], details: &str) -> String {
     let mut body = format!(
         "<p class=\"lead\">{} queries, {} with a match and {} without, against {} references. Model <code>{}</code>.</p>\n",
         summary.queries,
@@ -31,13 +31,20 @@ pub fn html(summary: &Summary, dataset: &Dataset, answers: &[Answer], details: &
         summary.database,
         escape(summary.config.model.as_str())
     );
+    if summary.queries_left_out > 0 {
+        body += &format!(
+            "<p>{} queries were asked again with their own place left out of the database. They judge rejection and \
+             confidences; recall is that of the first time.</p>\n",
+            summary.queries_left_out
+        );
+    }
     body += &recall_table(summary);
     body += &calibration_table(summary);
     body += &poses_table(summary);
     body += &groups_table(summary);
     body += &costs_table(summary);
     body += "<h2>Plots</h2>\n";
-    body += &plots(summary, dataset, answers);
+    body += &plots(summary, dataset, answers, left_out);
     body += details;
     body += &problems(summary);
     let config = serde_json::to_string_pretty(&summary.config).unwrap_or_default();
@@ -87,7 +94,12 @@ fn recall_table(summary: &Summary) -> String {
         row("re-ranked", recall, interval, map, rejection);
     }
     let headers: Vec<&str> = headers.iter().map(String::as_str).collect();
-    table("Recall in percent over the queries that have a match, with bootstrap intervals", &headers, &rows)
+    table(
+        "Recall in percent over the queries that have a match, with bootstrap intervals (which take queries to be \
+         independent: where they follow each other along a street, the truth is wider)",
+        &headers,
+        &rows,
+    )
 }
 
 fn calibration_table(summary: &Summary) -> String {
@@ -96,9 +108,12 @@ fn calibration_table(summary: &Summary) -> String {
         let error = format!("{:.3}", fitted.expected_calibration_error);
         rows.push(vec!["fitted here, five-fold".into(), error, "-".into(), "-".into(), "-".into()]);
     }
-    if let Some(Applied { expected_calibration_error, trusted, .. }) = &summary.shipped_calibration {
+    for (name, applied) in
+        [("the model's own", &summary.shipped_calibration), ("the one given", &summary.given_calibration)]
+    {
+        let Some(Applied { expected_calibration_error, trusted, .. }) = applied else { continue };
         rows.push(vec![
-            "the model's own".into(),
+            name.into(),
             format!("{expected_calibration_error:.3}"),
             format!("{:.3}", trusted.threshold),
             format!("{:.1}", 100.0 * trusted.precision),

@@ -11,7 +11,7 @@ use crate::eval::summary::Summary;
 const RECALL_TO: usize = 25;
 
 /// All plots that the data allow, as figures.
-pub fn plots(summary: &Summary, dataset: &Dataset, answers: &[Answer]) -> String {
+pub fn plots(summary: &Summary, dataset: &Dataset, answers: &[Answer], left_out: &[Answer]) -> String {
     let mut figures = Vec::new();
     if summary.queries_with_match > 0 {
         figures
@@ -20,7 +20,7 @@ pub fn plots(summary: &Summary, dataset: &Dataset, answers: &[Answer]) -> String
             .push((rejection_plot(summary), "Accepting only answers above a score: S, or nearness before re-ranking."));
     }
     if summary.recall.reranked.is_some() {
-        figures.push((score_plot(dataset, answers), "S of the best answer, by whether it is right."));
+        figures.push((score_plot(dataset, answers, left_out), "S of the best answer, by whether it is right."));
     }
     if let Some(plot) = reliability_plot(summary) {
         figures.push((plot, "Share of right answers by confidence, with the calibration error; the dashed line is ideal. What is fitted \
@@ -79,7 +79,7 @@ fn rejection_plot(summary: &Summary) -> String {
     .render()
 }
 
-fn score_plot(dataset: &Dataset, answers: &[Answer]) -> String {
+fn score_plot(dataset: &Dataset, answers: &[Answer], left_out: &[Answer]) -> String {
     let (mut right, mut wrong, mut none) = (Vec::new(), Vec::new(), Vec::new());
     for answer in answers {
         let Some(best) = answer.reranked.first() else { continue };
@@ -91,6 +91,7 @@ fn score_plot(dataset: &Dataset, answers: &[Answer]) -> String {
             Truth::Unknown => {}
         }
     }
+    none.extend(left_out.iter().filter_map(|answer| Some(f64::from(answer.reranked.first()?.score.spatial_score))));
     let series = [("right", "a", right), ("wrong", "b", wrong), ("no match exists", "c", none)];
     let series = series.into_iter().filter(|(_, _, values)| !values.is_empty());
     Histogram {
@@ -112,9 +113,13 @@ fn reliability_plot(summary: &Summary) -> Option<String> {
         let name = format!("fitted here, error {:.3}", fitted.expected_calibration_error);
         series.push(line(name, "a", &fitted.bins));
     }
-    if let Some(shipped) = &summary.shipped_calibration {
-        let name = format!("the model's own, error {:.3}", shipped.expected_calibration_error);
-        series.push(line(name, "b", &shipped.bins));
+    for (name, class, applied) in
+        [("the model's own", "b", &summary.shipped_calibration), ("the one given", "c", &summary.given_calibration)]
+    {
+        if let Some(applied) = applied {
+            let name = format!("{name}, error {:.3}", applied.expected_calibration_error);
+            series.push(line(name, class, &applied.bins));
+        }
     }
     if series.is_empty() {
         return None;

@@ -14,6 +14,13 @@ pub fn text(summary: &Summary) -> String {
         "{}: {} queries ({} with a match, {} without) against {} references",
         summary.dataset, summary.queries, summary.queries_with_match, summary.queries_without_match, summary.database
     );
+    if summary.queries_left_out > 0 {
+        let _ = writeln!(
+            out,
+            "{} queries were asked again with their own place left out: they judge rejection and confidences",
+            summary.queries_left_out
+        );
+    }
     let _ = writeln!(out, "model {}\n", summary.config.model);
     recall_table(&mut out, summary);
     for (name, rejection) in stages(&summary.rejection.global, summary.rejection.reranked.as_ref()) {
@@ -31,11 +38,16 @@ pub fn text(summary: &Summary) -> String {
     if let Some(calibration) = &summary.calibration {
         let _ = writeln!(out, "calibration error {:.3} (five-fold)", calibration.expected_calibration_error);
     }
-    if let Some(Applied { expected_calibration_error, trusted, .. }) = &summary.shipped_calibration {
+    let applied = [
+        ("the model's own curve", &summary.shipped_calibration),
+        ("the calibration given", &summary.given_calibration),
+    ];
+    for (name, applied) in applied {
+        let Some(Applied { expected_calibration_error, trusted, .. }) = applied else { continue };
         let _ = writeln!(
             out,
-            "calibration error {expected_calibration_error:.3} of the model's own curve, which trusts {} answers: \
-             precision {:.1}%, recall {:.1}%",
+            "calibration error {expected_calibration_error:.3} of {name}, which trusts {} answers: precision {:.1}%, \
+             recall {:.1}%",
             trusted.count,
             100.0 * trusted.precision,
             100.0 * trusted.recall

@@ -1,3 +1,5 @@
+//! The optimiser against values computed independently.
+
 use super::*;
 use crate::train::loss::{normalise_rows, triplet_margin_loss};
 use candle_core::Device;

@@ -1,5 +1,12 @@
+//! The differentiable transformer: the same numbers as the one that serves, right gradients, and a run on drawn places.
+
 use super::*;
 use crate::extract::{BlockWeights, CandleEncoder, Encoder, Geometry, Linear, Norm, Preset};
+use crate::image::encode_png;
+use crate::synth::{Condition, StreetWorld, Viewpoint};
+use crate::train::loss::triplet_margin_loss;
+use crate::train::triplets::Side;
+use crate::train::{Progress, Schedule};
 use crate::types::ImageSize;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -144,4 +151,132 @@ fn every_tensor_can_be_written_back_by_name() {
     }
     assert!(copy.tensors().iter().all(|(_, _, values)| values.iter().all(|value| *value == 0.25)));
     assert!(!copy.replace("blocks.9.norm1.weight", &[0.0; 8]));
+}
+
+/// Eight places of a drawn town, three views of each.
+fn drawn_places(folder: &Path) -> TripletSet {
+    let town = StreetWorld::new(5);
+    let mut images = Vec::new();
+    for place in 0..8u64 {
+        for view in 0..3 {
+            let viewpoint = Viewpoint { along_m: f64::from(view) * 0.6, across_m: 0.0, turn_deg: 0.0 };
+            let size = ImageSize { width: 64, height: 48 };
+            let picture = town.render(3 * place, viewpoint, Condition::Day, size);
+            let path = folder.join(format!("{place}-{view}.png"));
+            std::fs::write(&path, encode_png(&picture).unwrap()).unwrap();
+            images.push(path);
+        }
+    }
+    let group = |image: u32| (image / 3 * 3)..(image / 3 * 3 + 3);
+    TripletSet {
+        positives: (0..24).map(|image| group(image).filter(|&other| other != image).collect()).collect(),
+        near: (0..24).map(|image| group(image).collect()).collect(),
+        queries: images.clone(),
+        database: images,
+    }
+}
+
+fn config(total: u64) -> TrainConfig {
+    TrainConfig {
+        schedule: Schedule { peak: 0.01, warm_up: 10, total },
+        batch: 8,
+        steps_per_cycle: 10,
+        patience: 1000,
+        augmentation: Augmentation::NONE,
+        ..TrainConfig::default()
+    }
+}
+
+/// Trains in `folder`, interrupted after `stop_after` steps if it gets so far.
+fn train_in(
+    folder: &Path,
+    set: &TripletSet,
+    config: &TrainConfig,
+    stop_after: u64,
+) -> Option<(BackboneModel, Outcome)> {
+    let model = BackboneModel { augmentation: config.augmentation, ..model(TrainableBlocks::Last(1), false) };
+    let mut progress = |progress: Progress<'_>| match progress {
+        Progress::Cycle(record) if record.step >= stop_after => std::panic::panic_any("interrupted"),
+        _ => {}
+    };
+    let session = Session { folder: folder.to_owned(), identity: "drawn".into(), progress: &mut progress };
+    let run = std::panic::AssertUnwindSafe(|| model.train(set, set, config, session).unwrap());
+    let outcome = std::panic::catch_unwind(run).ok()?;
+    Some((model, outcome))
+}
+
+fn values(model: &BackboneModel) -> Vec<(String, Vec<f32>)> {
+    let flat = |variable: &Var| variable.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    model.variables.iter().map(|(name, variable)| (name.clone(), flat(variable))).collect()
+}
+
+#[test]
+fn eight_drawn_places_are_learnt_to_zero_loss() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = drawn_places(folder.path());
+    let (_, outcome) = train_in(&folder.path().join("run"), &set, &config(300), u64::MAX).unwrap();
+    assert!(outcome.initial.at_1 < 100.0, "{outcome:?}");
+    assert_eq!((outcome.last_loss, outcome.best.at_1), (0.0, 100.0), "{outcome:?}");
+}
+
+#[test]
+fn an_interrupted_run_of_blocks_continues_bit_for_bit() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = drawn_places(folder.path());
+    // Varied images too: their variations follow from the seed.
+    let config = TrainConfig { augmentation: Augmentation::default(), ..config(30) };
+    let (whole, broken) = (folder.path().join("whole"), folder.path().join("broken"));
+    let (straight, expected) = train_in(&whole, &set, &config, u64::MAX).unwrap();
+    assert!(train_in(&broken, &set, &config, 20).is_none());
+    let (continued, outcome) = train_in(&broken, &set, &config, u64::MAX).unwrap();
+    assert_eq!(outcome, expected);
+    assert_eq!(values(&continued), values(&straight));
+    assert_ne!(values(&straight), values(&model(TrainableBlocks::Last(1), false)), "nothing was learnt");
+}
+
+#[test]
+fn gradients_through_head_and_loss_agree_with_finite_differences() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = drawn_places(folder.path());
+    let model = model(TrainableBlocks::All, true);
+    let sample = |side, index| Sample { side, index, variation: None };
+    // Two triplets; the margin is so wide that both count.
+    let samples =
+        [0, 6, 1, 7, 12, 2].map(|index| sample(if index % 6 == 0 { Side::Query } else { Side::Database }, index));
+    let value = || {
+        let descriptors = model.embed(&set, &samples).unwrap();
+        let part = |role: usize| descriptors.narrow(0, role * 2, 2).unwrap();
+        triplet_margin_loss(&part(0), &part(1), &part(2), 4.0).unwrap()
+    };
+    let gradients = value().backward().unwrap();
+    let names = [
+        HEAD_WEIGHT,
+        HEAD_BIAS,
+        "blocks.1.mlp.fc2.weight",
+        "blocks.0.attn.qkv.weight",
+        "patch_embed.proj.weight",
+        "norm.weight",
+    ];
+    for name in names {
+        let variable = &model.variables[name];
+        let analytic = gradients.get(variable.as_tensor()).unwrap_or_else(|| panic!("no gradient of {name}"));
+        let analytic = analytic.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let at = (0..analytic.len()).max_by(|a, b| analytic[*a].abs().total_cmp(&analytic[*b].abs())).unwrap();
+        let start = variable.as_tensor().copy().unwrap();
+        let shifted = |shift: f32| {
+            let mut values = start.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            values[at] += shift;
+            variable.set(&Tensor::from_vec(values, start.shape(), &Device::Cpu).unwrap()).unwrap();
+            f64::from(value().to_scalar::<f32>().unwrap())
+        };
+        let step = 4e-3f32;
+        let numeric = (shifted(step) - shifted(-step)) / f64::from(2.0 * step);
+        variable.set(&start).unwrap();
+        let analytic = f64::from(analytic[at]);
+        assert!(analytic.abs() > 1e-3, "{name}: no gradient to speak of, {analytic}");
+        assert!(
+            (numeric - analytic).abs() < 0.03 * analytic.abs() + 2e-4,
+            "{name}[{at}]: {numeric} against {analytic}"
+        );
+    }
 }

@@ -1,0 +1,92 @@
+//! From photos to places with the real model: a town is imported into a server and recognised again.
+
+#[path = "common/town.rs"]
+mod town;
+
+use serde_json::Value;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Stdio};
+use std::time::{Duration, Instant};
+use town::{command, has_model, placeformer, succeeds, town};
+
+/// `serve` in a process of its own, killed when dropped.
+struct Server {
+    child: Child,
+    url: String,
+}
+
+impl Server {
+    #[track_caller]
+    fn start(folder: &Path) -> Self {
+        let mut serve = command(folder, &["serve", "--listen", "127.0.0.1:0", "--data", "store"]);
+        let mut child = serve.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        let url = lines.find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
+        let server = Self { child, url: url.expect("the server did not start") };
+        let began = Instant::now();
+        while !server.is_ready(folder) {
+            assert!(began.elapsed() < Duration::from_secs(120), "the server never became ready");
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        server
+    }
+
+    fn is_ready(&self, folder: &Path) -> bool {
+        placeformer(folder, &["healthcheck", "--server", &self.url]).status.success()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Query and reference, one pair a row; the reference is empty where the place is not mapped.
+fn pairs(folder: &Path) -> Vec<(String, String)> {
+    let text = std::fs::read_to_string(folder.join("town/ground_truth.csv")).unwrap();
+    let rows = text.lines().skip(1).filter_map(|row| row.split_once(','));
+    rows.map(|(query, reference)| (query.to_owned(), reference.to_owned())).collect()
+}
+
+#[test]
+fn a_town_is_imported_and_recognised() {
+    if !has_model() {
+        return;
+    }
+    let town = town("8", "2");
+    let folder = town.path();
+    let server = Server::start(folder);
+    let target = ["--map", "town", "--server", &server.url];
+    succeeds(folder, &[&["import", "town/database"][..], &target].concat());
+    let pairs = pairs(folder);
+    let mut queries: Vec<&str> =
+        pairs.iter().filter(|(_, reference)| !reference.is_empty()).map(|pair| pair.0.as_str()).collect();
+    queries.dedup();
+    assert!(queries.len() >= 8, "{queries:?}");
+    let first_is_right = |query: &&&str| {
+        let photo = format!("town/queries/{query}");
+        let answer = succeeds(folder, &[&["query", &photo, "--json"][..], &target].concat());
+        let answer: Value = serde_json::from_str(&answer).unwrap();
+        assert_eq!((&answer["reranked"], &answer["results"][0]["rank"]), (&Value::Bool(true), &1.into()), "{answer}");
+        let name = answer["results"][0]["external_id"].as_str().unwrap();
+        pairs.iter().any(|(asked, reference)| asked == **query && reference == name)
+    };
+    let right = queries.iter().filter(first_is_right).count();
+    assert!(2 * right > queries.len(), "{right} of {} queries are right", queries.len());
+}
+
+#[test]
+fn the_demo_runs_to_its_report() {
+    if !has_model() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let arguments = ["demo", "--places", "4", "--views", "1", "--pictures", "1", "--out", "shown"];
+    let said = succeeds(folder.path(), &arguments);
+    let page = std::fs::read_to_string(folder.path().join("shown/index.html")).unwrap();
+    assert!(page.contains("<html") && page.contains("data:image/") && said.contains("index.html"), "{said}");
+    assert!(folder.path().join("shown/match-1.png").exists());
+}
