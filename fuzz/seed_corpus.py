@@ -34,6 +34,12 @@ def palette():
     return struct.pack(">I", len(body)) + b"PLTE" + body + struct.pack(">I", zlib.crc32(b"PLTE" + body))
 
 
+def scan_bomb(scans):
+    """The JPEG with its one scan again and again before its end: each is a pass over the whole picture."""
+    start = JPEG.rindex(b"\xff\xda")
+    return JPEG + JPEG[start:] * (scans - 1) + b"\xff\xd9"
+
+
 def exif_jpeg(orientation):
     tiff = b"II*\0\x08\0\0\0" + struct.pack("<HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
     body = b"Exif\0\0" + tiff
@@ -43,6 +49,8 @@ def exif_jpeg(orientation):
 def image_seeds():
     seeds = {
         "jpeg": JPEG,
+        "jpeg_100_scans": scan_bomb(100),
+        "jpeg_3000_scans": scan_bomb(3000),
         "webp_lossy": WEBP_LOSSY,
         "webp_lossless": WEBP_LOSSLESS,
         "png_rgb": png(5, 3, 2, 8, 15),
@@ -116,13 +124,25 @@ QUERY_SEEDS = [
     "map=%00&top_k=-1",
     "map=a&map=b&unknown=1",
     "map=" + "a" * 300,
+    "map=a&external_id=drive7/000123.jpg&lat=51.5&lon=-0.13&heading=270&captured_at=2026-05-17T09:30:00Z",
+    "map=a&lat=95&lon=0",
+    "map=a&lat=1",
+    "map=a&heading=-1e-30&metadata=%7B%22camera%22:%22left%22%7D",
+    "map=a&metadata=7",
+    "map=a&limit=1000&cursor=0197f3c2-7c1e-7d3a-9b1f-2f6f0c1d2e3f",
+    "limit=0",
+    "external_id=a",
+    "map=a&external_id=a",
+    "reference_id=0197f3c2-7c1e-7d3a-9b1f-2f6f0c1d2e3f",
+    "reference_id=x",
+    "for=query",
 ]
 
 CONFIG_SEEDS = [
     '[http]\nlisten = "127.0.0.1:0"\nmax_connections = 10\n',
     "[extract]\ncaps = [400, 200, 50]\ntau = 1.0\n",
     '[extract]\npreset = "dinov2-vits14"\ninput_size = [448, 336]\nexit_block = 8\n',
-    "[rerank]\nscales = [[1], [1, 2], [2, 3]]\n",
+    '[rerank]\nscales = ["1", "1+2", "2+3"]\n',
     '[auth]\n[[auth.keys]]\nname = "a"\nsha256 = "' + "0" * 64 + '"\nrole = "read"\n',
     "[pipeline]\nqueue_capacity = 64\ntop_k = 10\ncandidates = 100\n",
     '[log]\nformat = "json"\nfilter = "info"\n',

@@ -14,6 +14,7 @@ use crate::ops::LogConfig;
 use crate::pipeline::PipelineConfig;
 use crate::rerank::RerankConfig;
 use crate::store::StoreConfig;
+use crate::types::InvalidValue;
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
@@ -24,6 +25,9 @@ mod manual;
 
 /// Prefix of the environment variables.
 const PREFIX: &str = "PLACEFORMER_";
+
+/// Reading connections that listings and look-ups leave alone: one for queries, one for the metrics.
+const READERS_KEPT_FREE: usize = 2;
 
 /// Every setting of the service.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -104,7 +108,7 @@ pub enum ConfigError {
     },
     /// A value is out of range.
     #[error("the configuration is not valid: {0}")]
-    Value(#[from] crate::types::InvalidValue),
+    Value(#[from] InvalidValue),
     /// The log filter cannot be parsed.
     #[error(transparent)]
     Filter(#[from] crate::ops::logging::InvalidFilter),
@@ -142,6 +146,10 @@ impl Config {
         self.http.check()?;
         self.auth.check()?;
         self.pipeline.check()?;
+        if self.pipeline.store_reads.saturating_add(READERS_KEPT_FREE) > self.store.readers {
+            let reason = format!("it must be at least {READERS_KEPT_FREE} less than store.readers");
+            return Err(InvalidValue::new("pipeline.store_reads", reason).into());
+        }
         self.extract.encoder_spec()?;
         self.log.check()?;
         Ok(())
@@ -222,6 +230,8 @@ mod tests {
             ("[web]\nlisten = \"x\"", "web"),
             ("[http]\nmax_page = \"many\"", "max_page"),
             ("[pipeline]\nqueue_capacity = 0", "queue_capacity"),
+            ("[pipeline]\nstore_reads = 7", "store_reads"),
+            ("[store]\nreaders = 5", "store_reads"),
             ("[log]\nfilter = \"placeformer=loud\"", "loud"),
             ("[[auth.keys]]\nname = \"a\"\nsha256 = \"12\"\nrole = \"read\"", "sha256"),
         ] {

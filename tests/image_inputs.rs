@@ -302,6 +302,25 @@ fn a_file_cut_anywhere_is_refused_and_says_so() {
 }
 
 #[test]
+fn a_jpeg_of_thousands_of_scans_is_refused_before_it_is_decoded() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/images");
+    for (name, target) in [("progressive.jpg", ImageSize { width: 12, height: 8 }), ("restarts_420.jpg", SIZE)] {
+        let jpeg = std::fs::read(folder.join(name)).unwrap();
+        let end = jpeg.len() - 2;
+        let last = jpeg.windows(2).rposition(|marker| marker == b"\xff\xda").unwrap();
+        let again = |scans: usize| [&jpeg[..end], &jpeg[last..end].repeat(scans), &jpeg[end..]].concat();
+        load_tensor(&jpeg, &ImageConfig::default(), target).unwrap();
+        let bomb = again(3000);
+        for refused in
+            [default_decode(&bomb).unwrap_err(), load_tensor(&bomb, &ImageConfig::default(), target).unwrap_err()]
+        {
+            assert_eq!(refused.code().as_str(), "image_undecodable", "{name}");
+            assert!(refused.to_string().contains("more than 100 scans"), "{name}: {refused}");
+        }
+    }
+}
+
+#[test]
 fn exif_gives_position_direction_and_time() {
     let rational =
         |parts: &[(u32, u32)]| Value::Rational(parts.iter().map(|&(num, denom)| Rational { num, denom }).collect());

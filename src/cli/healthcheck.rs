@@ -11,11 +11,21 @@ pub struct HealthcheckArgs {
     /// Only ask whether the process lives, not whether it is ready.
     #[arg(long)]
     live: bool,
+    /// Also ask whether it takes new references, which it does not while its disk is full.
+    #[arg(long, conflicts_with = "live")]
+    ingest: bool,
 }
 
-/// Succeeds if the server is ready; fails with its own reason if not.
+/// Succeeds if the server is ready for queries; fails with its own reason if not.
+///
+/// A full disk alone is no failure: a supervisor that restarted the server, or a balancer that left it out, would end
+/// the queries and deletions that still work and gain nothing.
 pub fn run(args: HealthcheckArgs) -> anyhow::Result<()> {
-    let path = if args.live { "/livez" } else { "/readyz" };
+    let path = match (args.live, args.ingest) {
+        (true, _) => "/livez",
+        (_, true) => "/readyz",
+        _ => "/readyz?for=query",
+    };
     let (status, body) = ServerClient::new(args.server)?.probe(path)?;
     ensure!(status == 200, "not ready ({status}): {body}");
     println!("{body}");

@@ -98,7 +98,7 @@ pub async fn run_server(
     let (metrics, health) = (Arc::new(Metrics::new()?), Arc::new(Health::default()));
     let state =
         AppState::new(config.http.clone(), &config.auth, config.image.max_bytes, metrics.clone(), health.clone())?;
-    let disk_watch = tokio::spawn(watch_disk(config.clone(), health.clone()));
+    let disk_watch = tokio::spawn(watch_disk(config.clone(), health.clone(), metrics.clone()));
     let opening = open(state.clone(), config, loaders);
     let serving = serve(listener, state, shutdown);
     tokio::pin!(serving);
@@ -129,11 +129,12 @@ async fn open(state: AppState, config: Config, loaders: Loaders) -> anyhow::Resu
     Ok(())
 }
 
-/// Keeps `disk_full` true to the disk.
-async fn watch_disk(config: Config, health: Arc<Health>) {
+/// Keeps `disk_full` and the gauge of free bytes true to the disk.
+async fn watch_disk(config: Config, health: Arc<Health>, metrics: Arc<Metrics>) {
     loop {
         let (data, reserve) = (config.data.directory.clone(), config.pipeline.disk_reserve_bytes);
         if let Ok(Ok(space)) = spawn_blocking(move || disk::space(&data)).await {
+            metrics.set_disk_free(space.free);
             health.set_disk_full(space.is_short_of(reserve));
         }
         tokio::time::sleep(DISK_CHECK).await;

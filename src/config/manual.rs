@@ -62,6 +62,12 @@ pub(super) const SECTIONS: &[(&str, Keys)] = &[
         &[
             ("queue_capacity", "Queries, and beside them references, waiting or in compute; beyond: 503 overloaded."),
             ("max_wait_ms", "Longest wait of a query for its turn; one that would wait longer gets 503 at once."),
+            (
+                "store_reads",
+                "Listings and look-ups at the store at once, at least two fewer than store.readers: those are\n\
+                 left to queries and metrics. Without a turn within max_wait_ms: 503 overloaded.",
+            ),
+            ("store_writes", "Changes and deletions under way at once, with the same wait."),
             ("patch_cache_bytes", "Key patches kept in memory for the next query."),
             ("top_k", "Results of a query that does not say."),
             ("candidates", "Candidates re-ranked for a query that does not say."),

@@ -2,6 +2,10 @@
 //!
 //! An image comes in one of three ways: as the raw body with parameters in the query string; as multipart, with
 //! parameters in a part named `json` or in the query string; as JSON with the image in base64 beside the parameters.
+//!
+//! Whatever memory a body takes on its way is taken from one budget first: the buffer it arrives in, and the images
+//! copied or decoded out of it. The images then carry their share along, so that it is given back when the pipeline
+//! is done with them, also when the client has left meanwhile.
 
 use super::AppState;
 use super::limits::Held;
@@ -12,25 +16,48 @@ use axum::extract::{FromRequest, Multipart, Query, Request};
 use axum::http::{HeaderMap, Uri, header};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use bytes::{Bytes, BytesMut};
+use bytes::Bytes;
 use http_body_util::BodyExt;
-use serde::de::DeserializeOwned;
+use serde::Deserializer;
+use serde::de::{DeserializeOwned, MapAccess, Visitor};
+use serde_json::value::RawValue;
 use serde_json::{Map, Value};
+use std::borrow::Cow;
 use std::collections::HashMap;
+use std::convert::Infallible;
 use std::time::Duration;
 use tokio::time::{Instant, timeout, timeout_at};
 
 /// Bytes of a body beyond its image: parameters, multipart boundaries.
 const BESIDE_THE_IMAGE: usize = 256 << 10;
+/// Least bytes of a member of an object beside its key and value: quotes, colon, comma.
+const MEMBER: usize = 4;
+/// First size of the buffer of a body whose length is not known.
+const FIRST_BUFFER: usize = 16 << 10;
+/// Bytes that the multipart parser gets at a time.
+const PIECE: usize = 64 << 10;
 /// Largest body without an image.
 const MAX_JSON_BYTES: usize = 256 << 10;
 
-/// Images and parameters of one request. The bytes count against the budget until it is dropped.
+/// Images and parameters of one request. An image counts against the budget until the last clone of it is dropped.
 pub struct Upload<P> {
     images: HashMap<&'static str, Bytes>,
     /// The parameters, wherever they came from.
     pub params: P,
-    _held: Held,
+}
+
+/// A body that has arrived.
+struct Received {
+    bytes: Vec<u8>,
+    /// Covers the buffer's capacity.
+    held: Held,
+}
+
+/// What a body is taken apart into.
+#[derive(Default)]
+struct Parts {
+    images: Vec<(&'static str, Vec<u8>)>,
+    json: Option<Map<String, Value>>,
 }
 
 impl<P> Upload<P> {
@@ -62,19 +89,19 @@ pub async fn read_upload<P: DeserializeOwned>(
     match kind.as_deref() {
         Some("multipart/form-data") => {
             let headers = request.headers().clone();
-            let (bytes, held) = read_bytes(state, request, image_bytes + BESIDE_THE_IMAGE).await?;
-            let (images, json) = split_multipart(headers, bytes, names).await?;
-            Ok(Upload { images, params: one_source(&uri, json)?, _held: held })
+            let received = read_bytes(state, request, image_bytes + BESIDE_THE_IMAGE).await?;
+            let (parts, held) = split_multipart(headers, received, names).await?;
+            finish(parts, held, &uri)
         }
         Some("application/json") => {
-            let (bytes, held) = read_bytes(state, request, image_bytes / 3 * 4 + BESIDE_THE_IMAGE).await?;
-            let (images, json) = split_json(&bytes, names)?;
-            Ok(Upload { images, params: one_source(&uri, Some(json))?, _held: held })
+            let received = read_bytes(state, request, image_bytes / 3 * 4 + BESIDE_THE_IMAGE).await?;
+            let (parts, held) = split_json(received, names)?;
+            finish(parts, held, &uri)
         }
         Some("image/jpeg" | "image/png" | "image/webp" | "application/octet-stream") => {
             let params = one_source(&uri, None)?;
-            let (bytes, held) = read_bytes(state, request, state.max_image_bytes).await?;
-            Ok(Upload { images: HashMap::from([(names[0], bytes)]), params, _held: held })
+            let Received { bytes, held } = read_bytes(state, request, state.max_image_bytes).await?;
+            Ok(Upload { images: names.iter().copied().zip(held.keep(vec![bytes])).collect(), params })
         }
         other => Err(ApiError::new(
             ErrorCode::UnsupportedMediaType,
@@ -94,7 +121,7 @@ pub async fn read_json<T: DeserializeOwned>(state: &AppState, request: Request) 
         let detail = format!("content-type {} is not application/json", kind.as_deref().unwrap_or("(none)"));
         return Err(ApiError::new(ErrorCode::UnsupportedMediaType, detail));
     }
-    let (bytes, _held) = read_bytes(state, request, MAX_JSON_BYTES).await?;
+    let Received { bytes, held: _held } = read_bytes(state, request, MAX_JSON_BYTES).await?;
     // Through an object, because a struct would also be read from an array.
     let object: Map<String, Value> = serde_json::from_slice(&bytes).map_err(json_error)?;
     serde_json::from_value(Value::Object(object)).map_err(json_error)
@@ -108,7 +135,8 @@ pub async fn read_file(state: &AppState, request: Request, limit: usize) -> Resu
         let detail = format!("content-type {} is not application/octet-stream", kind.as_deref().unwrap_or("(none)"));
         return Err(ApiError::new(ErrorCode::UnsupportedMediaType, detail));
     }
-    read_bytes(state, request, limit).await
+    let Received { bytes, held } = read_bytes(state, request, limit).await?;
+    Ok((bytes.into(), held))
 }
 
 /// Parses the query string; unknown names are refused by the type.
@@ -122,53 +150,87 @@ fn media_type(headers: &HeaderMap) -> Option<String> {
 }
 
 /// Buffers a body of at most `limit` bytes within the body timeouts and the budget.
-async fn read_bytes(state: &AppState, request: Request, limit: usize) -> Result<(Bytes, Held), ApiError> {
+async fn read_bytes(state: &AppState, request: Request, limit: usize) -> Result<Received, ApiError> {
     let too_large = || ApiError::new(ErrorCode::BodyTooLarge, format!("the body has more than {limit} bytes"));
     let mut body = request.into_body();
-    if HttpBody::size_hint(&body).lower() > limit as u64 {
+    let announced = HttpBody::size_hint(&body);
+    if announced.lower() > limit as u64 {
         return Err(too_large());
     }
+    let most = announced.upper().and_then(|upper| usize::try_from(upper).ok()).map_or(limit, |upper| upper.min(limit));
     let whole = Instant::now() + Duration::from_millis(state.http.body_timeout_ms);
     let pause = Duration::from_millis(state.http.body_idle_timeout_ms);
-    let mut held = state.body_memory.hold()?;
-    let mut bytes = BytesMut::new();
+    let mut received = Received { bytes: Vec::new(), held: state.body_memory.hold()? };
     loop {
         let frame = timeout_at(whole, timeout(pause, body.frame())).await;
         let frame = frame
             .ok()
             .and_then(Result::ok)
             .ok_or_else(|| ApiError::new(ErrorCode::RequestTimeout, "the body stopped arriving or took too long"))?;
-        let Some(frame) = frame else { return Ok((bytes.freeze(), held)) };
+        let Some(frame) = frame else { return Ok(received) };
         let frame = frame.map_err(|error| ApiError::malformed(format!("the body broke off: {error}")))?;
         let Ok(data) = frame.into_data() else { continue };
-        if bytes.len() + data.len() > limit {
+        if received.bytes.len() + data.len() > limit {
             return Err(too_large());
         }
-        state.body_memory.cover(&mut held, bytes.len() + data.len())?;
-        bytes.extend_from_slice(&data);
+        received.append(&data, most)?;
     }
 }
 
-type Images = HashMap<&'static str, Bytes>;
+impl Received {
+    /// Appends to the buffer, which doubles as bytes come, but not beyond the `most` that can come: what a client only
+    /// announces costs nothing.
+    fn append(&mut self, data: &[u8], most: usize) -> Result<(), ApiError> {
+        let (needed, capacity) = (self.bytes.len() + data.len(), self.bytes.capacity());
+        if needed > capacity {
+            let larger = needed.max((2 * capacity).max(FIRST_BUFFER).min(most));
+            // While the bytes move, there are two buffers.
+            self.held.resize(capacity + larger)?;
+            self.bytes.reserve_exact(larger - self.bytes.len());
+            self.held.resize(self.bytes.capacity())?;
+        }
+        self.bytes.extend_from_slice(data);
+        Ok(())
+    }
+}
+
+/// Hands the images over with the room they take.
+fn finish<P: DeserializeOwned>(parts: Parts, mut held: Held, uri: &Uri) -> Result<Upload<P>, ApiError> {
+    let (names, images): (Vec<_>, Vec<_>) = parts.images.into_iter().unzip();
+    held.resize(images.iter().map(Vec::capacity).sum())?;
+    let images = names.into_iter().zip(held.keep(images)).collect();
+    Ok(Upload { images, params: one_source(uri, parts.json)? })
+}
 
 async fn split_multipart(
     headers: HeaderMap,
-    bytes: Bytes,
+    received: Received,
     names: &'static [&'static str],
-) -> Result<(Images, Option<Map<String, Value>>), ApiError> {
-    let mut request = Request::new(Body::from(bytes));
+) -> Result<(Parts, Held), ApiError> {
+    let Received { bytes, mut held } = received;
+    // All images together are shorter than the body they are copied from.
+    held.resize(bytes.capacity() + bytes.len() + PIECE)?;
+    let mut left = bytes.len();
+    let mut request = Request::new(in_pieces(Bytes::from(bytes)));
     *request.headers_mut() = headers;
     axum::extract::DefaultBodyLimit::disable().apply(&mut request);
     let broken = |error: &dyn std::fmt::Display| ApiError::malformed(format!("the multipart body is broken: {error}"));
     let mut multipart = Multipart::from_request(request, &()).await.map_err(|error| broken(&error.body_text()))?;
-    let (mut images, mut json) = (HashMap::new(), None);
-    while let Some(field) = multipart.next_field().await.map_err(|error| broken(&error.body_text()))? {
+    let mut parts = Parts::default();
+    while let Some(mut field) = multipart.next_field().await.map_err(|error| broken(&error.body_text()))? {
         let name = field.name().unwrap_or_default().to_owned();
-        let content = field.bytes().await.map_err(|error| broken(&error.body_text()))?;
+        let mut content = Vec::with_capacity(left);
+        while let Some(chunk) = field.chunk().await.map_err(|error| broken(&error.body_text()))? {
+            content.extend_from_slice(&chunk);
+        }
+        content.shrink_to_fit();
+        left = left.saturating_sub(content.len());
         let repeated = if name == "json" {
-            json.replace(serde_json::from_slice(&content).map_err(json_error)?).is_some()
+            parts.json.replace(parameters(&content)?).is_some()
         } else if let Some(&known) = names.iter().find(|known| **known == name) {
-            images.insert(known, content).is_some()
+            let repeated = parts.images.iter().any(|(other, _)| *other == known);
+            parts.images.push((known, content));
+            repeated
         } else {
             let name: String = name.chars().take(80).collect();
             return Err(ApiError::invalid(format!("the part {name:?} is not known; use {names:?} and \"json\"")));
@@ -177,23 +239,101 @@ async fn split_multipart(
             return Err(ApiError::invalid(format!("the part {name:?} was sent twice")));
         }
     }
-    Ok((images, json))
+    Ok((parts, held))
 }
 
-fn split_json(bytes: &[u8], names: &'static [&'static str]) -> Result<(Images, Map<String, Value>), ApiError> {
-    let mut json: Map<String, Value> = serde_json::from_slice(bytes).map_err(json_error)?;
-    let mut images = HashMap::new();
-    for &name in names {
-        match json.remove(name) {
-            None => {}
-            Some(Value::String(text)) => {
-                let image = STANDARD.decode(text).map_err(|error| ApiError::invalid(format!("{name}: {error}")))?;
-                images.insert(name, Bytes::from(image));
-            }
-            Some(_) => return Err(ApiError::invalid(format!("{name}: it must be a string of base64"))),
-        }
+/// The JSON part. Once parsed, JSON takes many times its length, so it may not be as long as an image.
+fn parameters(content: &[u8]) -> Result<Map<String, Value>, ApiError> {
+    if content.len() > BESIDE_THE_IMAGE {
+        return Err(too_many_parameters());
     }
-    Ok((images, json))
+    serde_json::from_slice(content).map_err(json_error)
+}
+
+fn too_many_parameters() -> ApiError {
+    ApiError::new(
+        ErrorCode::BodyTooLarge,
+        format!("the parameters beside the images take more than {BESIDE_THE_IMAGE} bytes"),
+    )
+}
+
+/// A body that comes bit by bit: the parser copies what it is given, and so never holds more than a piece.
+fn in_pieces(mut rest: Bytes) -> Body {
+    let pieces = std::iter::from_fn(move || {
+        let piece = rest.split_to(rest.len().min(PIECE));
+        (!piece.is_empty()).then_some(Ok::<_, Infallible>(piece))
+    });
+    Body::from_stream(futures_util::stream::iter(pieces))
+}
+
+fn split_json(received: Received, names: &'static [&'static str]) -> Result<(Parts, Held), ApiError> {
+    let Received { bytes, mut held } = received;
+    let sent = SentJson::parse(&bytes, names)?;
+    let mut parts = Parts::default();
+    let mut taken = bytes.capacity();
+    for (name, raw) in sent.images {
+        let text = raw.get();
+        if !text.starts_with('"') {
+            return Err(ApiError::invalid(format!("{name}: it must be a string of base64")));
+        }
+        // Base64 needs no escapes, but some writers escape its slashes.
+        let escaped = text.contains('\\');
+        taken += text.len() / 4 * 3 + 3;
+        held.resize(taken + if escaped { text.len() } else { 0 })?;
+        let text: Cow<'_, str> = if escaped {
+            Cow::Owned(serde_json::from_str(text).map_err(json_error)?)
+        } else {
+            Cow::Borrowed(text.trim_matches('"'))
+        };
+        let image = STANDARD.decode(text.as_ref()).map_err(|error| ApiError::invalid(format!("{name}: {error}")))?;
+        parts.images.push((name, image));
+    }
+    let json: Result<Map<_, _>, _> =
+        sent.beside.into_iter().map(|(key, raw)| Ok((key, serde_json::from_str(raw.get())?))).collect();
+    parts.json = Some(json.map_err(json_error)?);
+    Ok((parts, held))
+}
+
+/// A JSON body looked at, but not copied: images are long, and parsed JSON takes many times its length.
+struct SentJson<'a> {
+    images: HashMap<&'static str, &'a RawValue>,
+    beside: Vec<(String, &'a RawValue)>,
+}
+
+impl<'a> SentJson<'a> {
+    fn parse(bytes: &'a [u8], names: &'static [&'static str]) -> Result<Self, ApiError> {
+        let mut deserializer = serde_json::Deserializer::from_slice(bytes);
+        let sent = deserializer.deserialize_map(ImagesApart(names)).map_err(json_error)?;
+        deserializer.end().map_err(json_error)?;
+        sent.ok_or_else(too_many_parameters)
+    }
+}
+
+/// Sorts the members of an object; `None` if those beside the images are too long.
+struct ImagesApart(&'static [&'static str]);
+
+impl<'de> Visitor<'de> for ImagesApart {
+    type Value = Option<SentJson<'de>>;
+
+    fn expecting(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.write_str("a JSON object")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<Self::Value, A::Error> {
+        let mut sent = SentJson { images: HashMap::new(), beside: Vec::new() };
+        let mut room = Some(BESIDE_THE_IMAGE);
+        while let Some((key, value)) = members.next_entry::<String, &RawValue>()? {
+            if let Some(&name) = self.0.iter().find(|name| **name == key) {
+                sent.images.insert(name, value);
+                continue;
+            }
+            room = room.and_then(|room| room.checked_sub(key.len() + value.get().len() + MEMBER));
+            if room.is_some() {
+                sent.beside.push((key, value));
+            }
+        }
+        Ok(room.map(|_| sent))
+    }
 }
 
 /// Parameters come from the query string or from JSON, not from both.

@@ -5,6 +5,7 @@ use crate::error::ErrorCode;
 use crate::http::problem::ApiError;
 use crate::ops::Metrics;
 use crate::ops::metrics::Rejection;
+use bytes::Bytes;
 use governor::clock::{Clock, DefaultClock};
 use governor::{DefaultDirectRateLimiter, DefaultKeyedRateLimiter, Quota, RateLimiter};
 use std::collections::HashMap;
@@ -89,39 +90,60 @@ pub struct BodyMemory {
 /// Bytes taken; given back when dropped.
 pub struct Held {
     permit: OwnedSemaphorePermit,
-    room: usize,
+    metrics: Arc<Metrics>,
 }
 
-impl BodyMemory {
-    const BLOCK: usize = 64 << 10;
+/// Bytes together with what they take of the budget, wherever they go.
+struct Charged {
+    bytes: Vec<u8>,
+    _held: Arc<Held>,
+}
 
+impl AsRef<[u8]> for Charged {
+    fn as_ref(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+const BLOCK: usize = 64 << 10;
+
+impl BodyMemory {
     /// A budget in bytes.
     pub fn new(bytes: usize, metrics: Arc<Metrics>) -> Self {
-        Self { blocks: Arc::new(Semaphore::new(bytes.div_ceil(Self::BLOCK).min(Semaphore::MAX_PERMITS))), metrics }
+        Self { blocks: Arc::new(Semaphore::new(bytes.div_ceil(BLOCK).min(Semaphore::MAX_PERMITS))), metrics }
     }
 
-    /// Starts holding nothing.
+    /// Starts with room for 64 KiB.
     pub fn hold(&self) -> Result<Held, ApiError> {
-        Ok(Held { permit: self.take(1)?, room: Self::BLOCK })
+        Ok(Held { permit: take(&self.blocks, 1, &self.metrics)?, metrics: self.metrics.clone() })
     }
+}
 
-    /// Grows `held` to cover `bytes` in all.
-    pub fn cover(&self, held: &mut Held, bytes: usize) -> Result<(), ApiError> {
-        if bytes > held.room {
-            let blocks = (bytes - held.room).div_ceil(Self::BLOCK);
-            held.permit.merge(self.take(blocks)?);
-            held.room += blocks * Self::BLOCK;
+impl Held {
+    /// Makes room for `bytes` in all, by taking more or by giving back.
+    pub fn resize(&mut self, bytes: usize) -> Result<(), ApiError> {
+        let (have, want) = (self.permit.num_permits(), bytes.div_ceil(BLOCK).max(1));
+        if want > have {
+            self.permit.merge(take(self.permit.semaphore(), want - have, &self.metrics)?);
+        } else {
+            drop(self.permit.split(have - want));
         }
         Ok(())
     }
 
-    fn take(&self, blocks: usize) -> Result<OwnedSemaphorePermit, ApiError> {
-        let blocks = u32::try_from(blocks).unwrap_or(u32::MAX);
-        self.blocks.clone().try_acquire_many_owned(blocks).map_err(|_| {
-            self.metrics.rejected(Rejection::BodyMemory);
-            ApiError::new(ErrorCode::Overloaded, "too many bytes of bodies are being received at once")
-        })
+    /// Buffers that share this room until the last of them, and of their clones, is dropped.
+    pub fn keep(self, buffers: Vec<Vec<u8>>) -> Vec<Bytes> {
+        let held = Arc::new(self);
+        buffers.into_iter().map(|bytes| Bytes::from_owner(Charged { bytes, _held: held.clone() })).collect()
     }
+}
+
+fn take(blocks: &Arc<Semaphore>, count: usize, metrics: &Metrics) -> Result<OwnedSemaphorePermit, ApiError> {
+    let count = u32::try_from(count).unwrap_or(u32::MAX);
+    blocks.clone().try_acquire_many_owned(count).map_err(|_| {
+        metrics.rejected(Rejection::BodyMemory);
+        ApiError::new(ErrorCode::Overloaded, "too many bytes of bodies are being received at once")
+    })
 }
 
 #[cfg(test)]
@@ -148,10 +170,24 @@ mod tests {
     fn body_memory_is_given_back() {
         let memory = BodyMemory::new(128 << 10, metrics());
         let mut first = memory.hold().unwrap();
-        assert!(memory.cover(&mut first, 129 << 10).is_err());
-        memory.cover(&mut first, 100 << 10).unwrap();
+        assert!(first.resize(129 << 10).is_err());
+        first.resize(100 << 10).unwrap();
         assert!(memory.hold().is_err());
+        first.resize(1).unwrap();
+        assert!(memory.hold().is_ok());
+        first.resize(128 << 10).unwrap();
         drop(first);
+        assert!(memory.hold().is_ok());
+    }
+
+    #[test]
+    fn bytes_are_charged_until_their_last_clone_is_gone() {
+        let memory = BodyMemory::new(64 << 10, metrics());
+        let images = memory.hold().unwrap().keep(vec![vec![1, 2, 3], vec![4]]);
+        let part = images[0].slice(1..2);
+        drop(images);
+        assert!(memory.hold().is_err());
+        drop(part);
         assert!(memory.hold().is_ok());
     }
 }

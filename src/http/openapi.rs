@@ -90,12 +90,12 @@ pub fn expect_routes(metrics: &Metrics) {
 /// What each operation can fail with.
 fn errors_of(path: &str, method: &str) -> Vec<ErrorCode> {
     use ErrorCode::*;
-    let guarded = [Unauthorized, Forbidden, RateLimited, NotReady, ShuttingDown, Internal];
-    let sent = [MalformedRequest, InvalidParameter, RequestTimeout, BodyTooLarge, UnsupportedMediaType, Overloaded];
+    let guarded = [Unauthorized, Forbidden, RateLimited, NotReady, Overloaded, ShuttingDown, Internal];
+    let sent = [MalformedRequest, InvalidParameter, RequestTimeout, BodyTooLarge, UnsupportedMediaType];
     let image = [EmptyImage, ImageTooLarge, ImageUndecodable];
     let own: &[&[ErrorCode]] = match (path, method) {
         ("/livez", _) | ("/openapi.json", _) => return vec![Internal],
-        ("/readyz", _) => return vec![],
+        ("/readyz", _) => return vec![InvalidParameter],
         ("/metrics", _) => return vec![Unauthorized, Forbidden, RateLimited, Internal],
         ("/references", "post") => &[&sent, &image, &[ExternalIdConflict, ModelMismatch, MemoryPressure, DiskFull]],
         ("/query", _) => &[&sent, &image, &[MapNotFound, ModelMismatch, DeadlineExceeded]],

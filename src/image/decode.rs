@@ -62,6 +62,7 @@ fn jpeg(bytes: &[u8], config: &ImageConfig, wanted: Option<ImageSize>) -> Result
         .set_strict_mode(true)
         .set_max_width(usize::from(u16::MAX))
         .set_max_height(usize::from(u16::MAX))
+        .jpeg_set_max_scans(header::MAX_JPEG_SCANS)
         .jpeg_set_out_colorspace(ColorSpace::RGB);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     decoder.decode_headers().map_err(fail)?;
@@ -69,12 +70,10 @@ fn jpeg(bytes: &[u8], config: &ImageConfig, wanted: Option<ImageSize>) -> Result
     // A JPEG's sides are 16-bit numbers.
     let size = ImageSize { width: width as u32, height: height as u32 };
     header::check_size(Format::Jpeg, size, config)?;
-    if !header::jpeg_is_complete(bytes) {
-        return Err(Format::Jpeg.undecodable("truncated: the end-of-image marker is missing"));
-    }
+    header::check_jpeg(bytes)?;
     let simple = matches!(decoder.input_colorspace(), Some(ColorSpace::YCbCr));
     if let Some(scale) = wanted.and_then(|wanted| reduction(size, wanted)).filter(|_| simple) {
-        return jpeg_reduced(bytes, size, scale);
+        return jpeg_reduced(bytes, size, scale, config);
     }
     let pixels = decoder.decode().map_err(fail)?;
     match decoder.output_colorspace() {
@@ -92,9 +91,10 @@ fn reduction(size: ImageSize, wanted: ImageSize) -> Option<u32> {
 }
 
 /// Decodes at `1 / scale` of the size: fewer coefficients, fewer pixels, the same picture.
-fn jpeg_reduced(bytes: &[u8], size: ImageSize, scale: u32) -> Result<RgbImage, ImageError> {
+fn jpeg_reduced(bytes: &[u8], size: ImageSize, scale: u32, config: &ImageConfig) -> Result<RgbImage, ImageError> {
     let fail = |error: jpeg_decoder::Error| Format::Jpeg.undecodable(error.to_string());
     let mut decoder = jpeg_decoder::Decoder::new(bytes);
+    decoder.set_max_decoding_buffer_size(usize::try_from(decoded_limit(config)).unwrap_or(usize::MAX));
     decoder.read_info().map_err(fail)?;
     // A JPEG's sides are 16-bit numbers.
     let side = |pixels: u32| pixels.div_ceil(scale) as u16;

@@ -114,39 +114,43 @@ pub(super) fn check_size(format: Format, size: ImageSize, config: &ImageConfig) 
     Ok(())
 }
 
-/// Whether a JPEG's last scan is followed by an end-of-image marker.
+/// Most scans of a JPEG. Cameras and encoders write one to about ten; each costs a pass over the whole picture, however
+/// few bytes it has, so a file of a few megabytes could otherwise keep a decoder busy for hours.
+pub(super) const MAX_JPEG_SCANS: usize = 100;
+
+/// Checks that a JPEG's last scan is followed by an end-of-image marker, and that it has no absurd number of scans.
 ///
 /// Decoders paint what is missing grey; half a picture would match half a place, so a file without its end is
 /// refused. Entropy-coded data never holds `FF` before anything but `00` or a restart marker, so the end is found by
-/// walking the segments. Bytes after it (a second picture, a maker's appendix) do not matter.
-pub(super) fn jpeg_is_complete(bytes: &[u8]) -> bool {
-    let mut at = 2;
-    let mut in_scan = false;
+/// walking the segments, as the decoders do. Bytes after it (a second picture, a maker's appendix) do not matter.
+pub(super) fn check_jpeg(bytes: &[u8]) -> Result<(), ImageError> {
+    let truncated = || Format::Jpeg.undecodable("truncated: the end-of-image marker is missing");
+    let (mut at, mut scans) = (2, 0);
     while at + 1 < bytes.len() {
         if bytes[at] != 0xff {
-            match bytes[at..].iter().position(|&byte| byte == 0xff) {
-                Some(skip) => at += skip,
-                None => return false,
-            }
+            at += bytes[at..].iter().position(|&byte| byte == 0xff).ok_or_else(truncated)?;
             continue;
         }
         match bytes[at + 1] {
-            0xd9 => return true,
+            0xd9 => return Ok(()),
             // Stuffing, restarts and stand-alone markers carry no length; a second FF is padding.
             0x00 | 0x01 | 0xd0..=0xd8 => at += 2,
             0xff => at += 1,
             marker => {
-                let Some(length) = bytes.get(at + 2..at + 4) else { return false };
+                let length = bytes.get(at + 2..at + 4).ok_or_else(truncated)?;
                 let length = usize::from(u16::from_be_bytes([length[0], length[1]]));
-                in_scan |= marker == 0xda;
-                if length < 2 && !in_scan {
-                    return false;
+                scans += usize::from(marker == 0xda);
+                if scans > MAX_JPEG_SCANS {
+                    return Err(Format::Jpeg.undecodable(format!("it has more than {MAX_JPEG_SCANS} scans")));
+                }
+                if length < 2 && scans == 0 {
+                    return Err(truncated());
                 }
                 at += 2 + length;
             }
         }
     }
-    false
+    Err(truncated())
 }
 
 #[cfg(test)]
@@ -170,9 +174,21 @@ mod tests {
     #[test]
     fn completeness_needs_the_end_marker_outside_segments() {
         let comment_with_end = b"\xff\xd8\xff\xfe\x00\x04\xff\xd9";
-        assert!(!jpeg_is_complete(comment_with_end));
+        assert!(check_jpeg(comment_with_end).is_err());
         let stuffed = b"\xff\xd8\xff\xda\x00\x02abc\xff\x00\xd9\xff\xd0z";
-        assert!(!jpeg_is_complete(stuffed));
-        assert!(jpeg_is_complete(&[stuffed.as_slice(), b"\xff\xd9tail"].concat()));
+        assert!(check_jpeg(stuffed).is_err());
+        assert!(check_jpeg(&[stuffed.as_slice(), b"\xff\xd9tail"].concat()).is_ok());
+    }
+
+    #[test]
+    fn scans_are_counted_outside_segments_only() {
+        let scan = b"\xff\xda\x00\x02xy";
+        let with = |scans: usize| [b"\xff\xd8".as_slice(), &scan.repeat(scans), b"\xff\xd9"].concat();
+        assert!(check_jpeg(&with(MAX_JPEG_SCANS)).is_ok());
+        let refused = check_jpeg(&with(MAX_JPEG_SCANS + 1)).unwrap_err().to_string();
+        assert!(refused.contains("more than 100 scans"), "{refused}");
+        let hidden = scan.repeat(200);
+        let comment = [b"\xff\xd8\xff\xfe".as_slice(), &(hidden.len() as u16 + 2).to_be_bytes(), &hidden];
+        assert!(check_jpeg(&[&comment.concat(), scan.as_slice(), b"\xff\xd9"].concat()).is_ok());
     }
 }

@@ -1,7 +1,8 @@
 //! Whether the server is ready, and if not, why.
 //!
 //! One [`Health`] is shared by everything. Start-up moves it forward phase by phase, shutdown turns it to draining,
-//! and a full disk holds it back while it lasts. `/readyz` prints the first reason found.
+//! and a full disk holds it back while it lasts. `/readyz` prints the first reason found; `/readyz?for=query` leaves the
+//! disk out.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -119,6 +120,11 @@ impl Health {
 
     /// The reason for not being ready; `None` when ready.
     pub fn unready(&self) -> Option<Unready> {
+        self.unready_for_queries().or_else(|| self.is_disk_full().then_some(Unready::DiskFull))
+    }
+
+    /// The reason for not answering queries, which a full disk is not; `None` when they are answered.
+    pub fn unready_for_queries(&self) -> Option<Unready> {
         if self.is_draining() {
             return Some(Unready::Draining);
         }
@@ -129,7 +135,7 @@ impl Health {
                 done: self.indexed.load(Ordering::Relaxed),
                 total: self.to_index.load(Ordering::Relaxed),
             }),
-            Phase::Serving => self.is_disk_full().then_some(Unready::DiskFull),
+            Phase::Serving => None,
         }
     }
 
@@ -156,7 +162,9 @@ mod tests {
         assert_eq!(health.unready(), None);
         health.set_disk_full(true);
         assert_eq!(health.unready(), Some(Unready::DiskFull));
+        assert_eq!(health.unready_for_queries(), None);
         health.draining();
         assert_eq!(health.unready(), Some(Unready::Draining));
+        assert_eq!(health.unready_for_queries(), Some(Unready::Draining));
     }
 }

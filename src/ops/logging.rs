@@ -1,6 +1,8 @@
 //! Logs: for people on a terminal, or one JSON object a line for collectors.
 
 use serde::{Deserialize, Serialize};
+use std::backtrace::{Backtrace, BacktraceStatus};
+use std::panic::PanicHookInfo;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
 
@@ -51,7 +53,8 @@ impl LogConfig {
     }
 }
 
-/// Sends all events to standard error from now on. A second call keeps the first one's settings.
+/// Sends all events, and the text of panics, to standard error from now on. A second call keeps the first one's
+/// settings.
 pub fn init(config: &LogConfig) -> Result<(), InvalidFilter> {
     let lines = tracing_subscriber::fmt()
         .with_env_filter(config.directives()?)
@@ -61,10 +64,19 @@ pub fn init(config: &LogConfig) -> Result<(), InvalidFilter> {
         LogFormat::Human => lines.try_init(),
         LogFormat::Json => lines.json().flatten_event(true).with_current_span(true).with_span_list(false).try_init(),
     };
-    if outcome.is_err() {
-        tracing::debug!("logs were set up before");
+    match outcome {
+        Ok(()) => std::panic::set_hook(Box::new(log_panic)),
+        Err(_) => tracing::debug!("logs were set up before"),
     }
     Ok(())
+}
+
+/// A panic is an event like any other: one line, in the format of the others, with the request it happened in.
+fn log_panic(panic: &PanicHookInfo<'_>) {
+    let backtrace = Backtrace::capture();
+    let backtrace = (backtrace.status() == BacktraceStatus::Captured).then(|| backtrace.to_string());
+    let location = panic.location().map(ToString::to_string);
+    tracing::error!(panic = panic.payload_as_str().unwrap_or("no text"), location, backtrace, "a thread panicked");
 }
 
 #[cfg(test)]

@@ -52,6 +52,8 @@ impl Stage {
 pub enum Rejection {
     /// The compute queue is full.
     QueueFull,
+    /// Too many others read or change the store.
+    StoreBusy,
     /// Too many bytes of bodies are being received.
     BodyMemory,
     /// The key's rate is used up.
@@ -72,8 +74,9 @@ pub enum Rejection {
 
 impl Rejection {
     /// All reasons.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::QueueFull,
+        Self::StoreBusy,
         Self::BodyMemory,
         Self::RateLimited,
         Self::MemoryPressure,
@@ -88,6 +91,7 @@ impl Rejection {
     pub fn as_str(self) -> &'static str {
         match self {
             Self::QueueFull => "queue_full",
+            Self::StoreBusy => "store_busy",
             Self::BodyMemory => "body_memory",
             Self::RateLimited => "rate_limited",
             Self::MemoryPressure => "memory_pressure",
@@ -152,6 +156,8 @@ pub struct Metrics {
     unmatched: IntCounter,
     corrupt_records: IntCounter,
     quarantined: IntGauge,
+    ready: IntGauge,
+    disk_free_bytes: IntGauge,
     cache_lookups: IntCounterVec,
 }
 
@@ -177,6 +183,8 @@ impl Metrics {
             unmatched: IntCounter::new(full("query_unmatched_total"), "Queries whose best answer is not trusted.")?,
             corrupt_records: IntCounter::new(full("corrupt_records_total"), "Damaged records that queries met.")?,
             quarantined: IntGauge::new(full("quarantined_references"), "Damaged references set aside, not served.")?,
+            ready: IntGauge::new(full("ready"), "1 if queries are answered (/readyz?for=query), else 0.")?,
+            disk_free_bytes: IntGauge::new(full("disk_free_bytes"), "Free bytes on the store's disk.")?,
             cache_lookups: counter("patch_cache_lookups_total", "Key patches asked of the cache.", &["result"])?,
         };
         metrics.register()?;
@@ -200,6 +208,8 @@ impl Metrics {
         self.registry.register(Box::new(self.unmatched.clone()))?;
         self.registry.register(Box::new(self.corrupt_records.clone()))?;
         self.registry.register(Box::new(self.quarantined.clone()))?;
+        self.registry.register(Box::new(self.ready.clone()))?;
+        self.registry.register(Box::new(self.disk_free_bytes.clone()))?;
         self.registry.register(Box::new(self.cache_lookups.clone()))?;
         self.registry.register(Box::new(prometheus::process_collector::ProcessCollector::for_self()))
     }
@@ -282,6 +292,16 @@ impl Metrics {
     /// Damaged references that are set aside until they are sent again or deleted.
     pub fn set_quarantined(&self, references: usize) {
         self.quarantined.set(references as i64);
+    }
+
+    /// Whether queries are answered.
+    pub fn set_ready(&self, ready: bool) {
+        self.ready.set(i64::from(ready));
+    }
+
+    /// Free bytes on the disk that holds the store.
+    pub fn set_disk_free(&self, bytes: u64) {
+        self.disk_free_bytes.set(i64::try_from(bytes).unwrap_or(i64::MAX));
     }
 
     /// The patch cache was asked.

@@ -4,7 +4,9 @@
 //! pace at which others leave, is refused at once with the time after which it is worth trying again; so what is let in
 //! is answered soon, however much is asked.
 //!
-//! Queries and ingest each have a door of their own: a bulk import must not turn vehicles away.
+//! Queries and ingest each have a door of their own: a bulk import must not turn vehicles away. What needs only the
+//! store (listings, look-ups, changes) waits for one of a few [`Turns`], so that it never takes all the threads and
+//! connections that queries need.
 
 use super::PipelineError;
 use crate::ops::Metrics;
@@ -13,6 +15,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::timeout;
 
 /// Requests let in while nothing is known about the pace yet.
 const PLACES_AT_UNKNOWN_PACE: usize = 8;
@@ -91,6 +94,32 @@ impl Drop for Ticket {
         self.place.take();
         self.admission.departed(self.entered);
         self.admission.metrics.queue_left();
+    }
+}
+
+/// A few places that are taken in turn, first come, first served.
+pub(super) struct Turns {
+    places: Arc<Semaphore>,
+    metrics: Arc<Metrics>,
+}
+
+impl Turns {
+    pub(super) fn new(places: usize, metrics: Arc<Metrics>) -> Self {
+        Self { places: Arc::new(Semaphore::new(places)), metrics }
+    }
+
+    /// Waits for a place, but not longer than `patience`. It is given back when dropped.
+    ///
+    /// Cancel safety: who is dropped while waiting leaves the line.
+    pub(super) async fn take(&self, patience: Duration) -> Result<OwnedSemaphorePermit, PipelineError> {
+        match timeout(patience, self.places.clone().acquire_owned()).await {
+            // The semaphore is never closed.
+            Ok(place) => place.map_err(|_| PipelineError::ShuttingDown),
+            Err(_) => {
+                self.metrics.rejected(Rejection::StoreBusy);
+                Err(PipelineError::StoreBusy)
+            }
+        }
     }
 }
 

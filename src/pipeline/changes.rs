@@ -81,12 +81,21 @@ impl Service {
         Ok(())
     }
 
-    /// Runs a write to its end even if the caller goes away meanwhile: store and index change together.
+    /// Changes the store in turn with others.
+    ///
+    /// Cancel safety: dropped while waiting, nothing is written; dropped later, the write runs to its end, because
+    /// store and index change together.
     pub(super) async fn write<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&Self) -> Result<T, PipelineError> + Send + 'static,
     ) -> Result<T, PipelineError> {
+        let place = self.store_writes.take(self.patience()).await?;
         let service = self.clone();
-        blocking(move || work(&service)).await.map_err(|_| PipelineError::Panicked { stage: "the store" })?
+        let outcome = blocking(move || {
+            let outcome = work(&service);
+            drop(place);
+            outcome
+        });
+        outcome.await.map_err(|_| PipelineError::Panicked { stage: "the store" })?
     }
 }

@@ -11,6 +11,11 @@ pub struct PipelineConfig {
     pub queue_capacity: usize,
     /// Longest time a query may wait for its turn, in milliseconds; one that would wait longer is told at once.
     pub max_wait_ms: u64,
+    /// Listings and look-ups that read the store at once. Fewer than `store.readers`, so that queries always find a
+    /// connection; one that gets no turn within `max_wait_ms` is told to come back later.
+    pub store_reads: usize,
+    /// Changes and deletions under way at once, with the same wait.
+    pub store_writes: usize,
     /// Bytes of key patches kept in memory for the next query.
     pub patch_cache_bytes: u64,
     /// Results of a query that does not say.
@@ -36,6 +41,8 @@ impl Default for PipelineConfig {
         Self {
             queue_capacity: 64,
             max_wait_ms: 2000,
+            store_reads: 4,
+            store_writes: 16,
             patch_cache_bytes: 256 << 20,
             top_k: 10,
             candidates: 100,
@@ -55,6 +62,8 @@ impl PipelineConfig {
         let positive = [
             ("pipeline.queue_capacity", self.queue_capacity as u64),
             ("pipeline.max_wait_ms", self.max_wait_ms),
+            ("pipeline.store_reads", self.store_reads as u64),
+            ("pipeline.store_writes", self.store_writes as u64),
             ("pipeline.top_k", self.top_k as u64),
             ("pipeline.candidates", self.candidates as u64),
             ("pipeline.deadline_ms", self.deadline_ms),
@@ -65,8 +74,13 @@ impl PipelineConfig {
         if self.top_k.max(self.candidates) > self.max_candidates {
             return Err(InvalidValue::new("pipeline.max_candidates", "it is below the default top_k or candidates"));
         }
-        if self.queue_capacity > tokio::sync::Semaphore::MAX_PERMITS {
-            return Err(InvalidValue::new("pipeline.queue_capacity", "it is too large"));
+        let places = [
+            ("pipeline.queue_capacity", self.queue_capacity),
+            ("pipeline.store_reads", self.store_reads),
+            ("pipeline.store_writes", self.store_writes),
+        ];
+        if let Some((field, _)) = places.iter().find(|(_, places)| *places > tokio::sync::Semaphore::MAX_PERMITS) {
+            return Err(InvalidValue::new(field, "it is too large"));
         }
         Ok(())
     }

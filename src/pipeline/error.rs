@@ -75,6 +75,9 @@ pub enum PipelineError {
         /// When a place is likely to be free.
         retry_after: Duration,
     },
+    /// Too many others read or change the store.
+    #[error("the store is busy with other requests, and no turn came soon enough")]
+    StoreBusy,
     /// Resident memory is above the watermark.
     #[error(transparent)]
     MemoryPressure(#[from] crate::ops::memory::MemoryShort),
@@ -113,7 +116,7 @@ impl PipelineError {
             Self::HeadMismatch { .. } => ErrorCode::HeadMismatch,
             Self::RerankMismatch { .. } => ErrorCode::CalibrationMismatch,
             Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
-            Self::Overloaded { .. } => ErrorCode::Overloaded,
+            Self::Overloaded { .. } | Self::StoreBusy => ErrorCode::Overloaded,
             Self::MemoryPressure(_) => ErrorCode::MemoryPressure,
             Self::DiskFull => ErrorCode::DiskFull,
             Self::DeadlineExceeded { .. } => ErrorCode::DeadlineExceeded,

@@ -1,14 +1,21 @@
 //! Bytes to a descriptor: decoding beside, extraction behind the one compute worker.
+//!
+//! Blocking work cannot be stopped once it has begun, but whoever waits for it may leave at any moment. So every
+//! permit, lock and ticket that bounds such work moves into it and is given back when the work itself ends: clients
+//! that hang up and come again get no more threads than clients that stay.
 
-use super::blocking::blocking;
+use super::admission::Ticket;
+use super::blocking::{Panicked, blocking};
 use super::{DescriptorSource, PipelineError, Timings};
-use crate::image::{self, ImageConfig};
+use crate::image::ImageConfig;
 use crate::ops::{Metrics, Stage};
 use crate::types::{Deadline, Descriptor, ImageTensor};
 use bytes::Bytes;
+use std::future::Future;
 use std::sync::Arc;
 use std::time::Instant;
-use tokio::sync::{Mutex, Semaphore};
+use tokio::sync::{Mutex, OwnedMutexGuard, Semaphore};
+use tokio::time::timeout;
 
 /// What a descriptor is for.
 #[derive(Debug, Clone, Copy)]
@@ -23,13 +30,41 @@ pub(super) struct Extraction {
     source: Arc<dyn DescriptorSource>,
     image: Arc<ImageConfig>,
     /// Decoders at work: one per core, so that a burst does not starve the model.
-    decoders: Semaphore,
+    decoders: Arc<Semaphore>,
     /// First come, first served; a waiter that is dropped leaves the line.
-    worker: Mutex<()>,
+    worker: Arc<Mutex<()>>,
     /// Held by the one reference that stands in that line; the others wait here, so that a query never waits for more
     /// than one of them.
-    ingest: Mutex<()>,
+    ingest: Arc<Mutex<()>>,
     metrics: Arc<Metrics>,
+}
+
+/// The right to compute; given back when dropped.
+struct Turn {
+    _worker: OwnedMutexGuard<()>,
+    _ingest: Option<OwnedMutexGuard<()>>,
+}
+
+impl Purpose {
+    /// Fails once the deadline has passed, naming the stage that it kept from running.
+    pub(super) fn not_passed(self, stage: &'static str) -> Result<(), PipelineError> {
+        match self {
+            Self::Answer(deadline) if deadline.has_passed() => Err(PipelineError::DeadlineExceeded { stage }),
+            _ => Ok(()),
+        }
+    }
+
+    /// Waits for `work` until the deadline.
+    ///
+    /// Cancel safety: as `work`, which is dropped when the deadline passes.
+    async fn in_time<T>(self, stage: &'static str, work: impl Future<Output = T>) -> Result<T, PipelineError> {
+        match self {
+            Self::Answer(deadline) => {
+                timeout(deadline.remaining(), work).await.map_err(|_| PipelineError::DeadlineExceeded { stage })
+            }
+            Self::Ingest => Ok(work.await),
+        }
+    }
 }
 
 impl Extraction {
@@ -38,9 +73,9 @@ impl Extraction {
         Self {
             source,
             image: Arc::new(image),
-            decoders: Semaphore::new(cores),
-            worker: Mutex::new(()),
-            ingest: Mutex::new(()),
+            decoders: Arc::new(Semaphore::new(cores)),
+            worker: Arc::default(),
+            ingest: Arc::default(),
             metrics,
         }
     }
@@ -49,45 +84,77 @@ impl Extraction {
         &self.source
     }
 
-    /// What the model sees in `bytes`.
+    /// What the model sees in `bytes`. `ticket` is kept until the last work for it has ended.
     ///
-    /// Cancel safety: dropped while waiting, nothing is computed.
+    /// Cancel safety: dropped while waiting, nothing is computed; dropped later, what is being computed is finished
+    /// under the bounds it began with, and its outcome is lost.
     pub(super) async fn describe(
         &self,
         bytes: Bytes,
         purpose: Purpose,
+        ticket: &Arc<Ticket>,
         timings: &mut Timings,
     ) -> Result<Descriptor, PipelineError> {
-        let tensor = self.decode(bytes, timings).await?;
+        let tensor = self.decode(bytes, purpose, ticket, timings).await?;
         let waiting_since = Instant::now();
-        let turn_of_ingest = match purpose {
-            Purpose::Ingest => Some(self.ingest.lock().await),
-            Purpose::Answer(_) => None,
-        };
-        let turn = self.worker.lock().await;
+        let turn = purpose.in_time("extraction", self.turn(purpose)).await?;
         timings.record(&self.metrics, Stage::Queue, waiting_since.elapsed());
-        if let Purpose::Answer(deadline) = purpose {
-            not_passed(deadline, "extraction")?;
-        }
-        let (source, started) = (self.source.clone(), Instant::now());
-        let described = blocking(move || source.describe(&[tensor])).await;
-        drop((turn, turn_of_ingest));
+        purpose.not_passed("extraction")?;
+        let (source, ticket, started) = (self.source.clone(), ticket.clone(), Instant::now());
+        let described = blocking(move || {
+            let described = source.describe(&[tensor]);
+            drop((turn, ticket));
+            described
+        });
+        let described = purpose.in_time("extraction", described).await?;
         timings.record(&self.metrics, Stage::Extract, started.elapsed());
         let mut descriptors = described.map_err(|_| PipelineError::Panicked { stage: "extraction" })??;
         descriptors.pop().ok_or(PipelineError::Panicked { stage: "extraction" })
     }
 
-    async fn decode(&self, bytes: Bytes, timings: &mut Timings) -> Result<ImageTensor, PipelineError> {
-        // The semaphore is never closed.
-        let _decoder = self.decoders.acquire().await.map_err(|_| PipelineError::ShuttingDown)?;
-        let (config, size, started) = (self.image.clone(), self.source.input_size(), Instant::now());
-        let decoded = blocking(move || image::load_tensor(&bytes, &config, size)).await;
-        timings.record(&self.metrics, Stage::Decode, started.elapsed());
-        Ok(decoded.map_err(|_| PipelineError::DecoderPanicked)??)
+    async fn turn(&self, purpose: Purpose) -> Turn {
+        let ingest = match purpose {
+            Purpose::Ingest => Some(self.ingest.clone().lock_owned().await),
+            Purpose::Answer(_) => None,
+        };
+        Turn { _worker: self.worker.clone().lock_owned().await, _ingest: ingest }
     }
-}
 
-/// Fails once `deadline` has passed, naming the stage that it kept from running.
-pub(super) fn not_passed(deadline: Deadline, stage: &'static str) -> Result<(), PipelineError> {
-    if deadline.has_passed() { Err(PipelineError::DeadlineExceeded { stage }) } else { Ok(()) }
+    async fn decode(
+        &self,
+        bytes: Bytes,
+        purpose: Purpose,
+        ticket: &Arc<Ticket>,
+        timings: &mut Timings,
+    ) -> Result<ImageTensor, PipelineError> {
+        let (source, config) = (self.source.clone(), self.image.clone());
+        let decoding = self.beside(ticket, move || {
+            let started = Instant::now();
+            (source.decode(&bytes, &config), started.elapsed())
+        });
+        let decoded = purpose.in_time("decoding", decoding).await??;
+        let (decoded, took) = decoded.map_err(|_| PipelineError::DecoderPanicked)?;
+        timings.record(&self.metrics, Stage::Decode, took);
+        Ok(decoded?)
+    }
+
+    /// Runs `work` on the bytes of an image, beside the model, on no more threads than there are cores.
+    ///
+    /// Cancel safety: dropped before the work began, it never begins; dropped later, it holds its place and `ticket`
+    /// until it ends.
+    pub(super) async fn beside<T: Send + 'static>(
+        &self,
+        ticket: &Arc<Ticket>,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<Result<T, Panicked>, PipelineError> {
+        // The semaphore is never closed.
+        let place = self.decoders.clone().acquire_owned().await.map_err(|_| PipelineError::ShuttingDown)?;
+        let ticket = ticket.clone();
+        Ok(blocking(move || {
+            let done = work();
+            drop((place, ticket));
+            done
+        })
+        .await)
+    }
 }

@@ -1,5 +1,6 @@
 //! Image and metadata to a durable, searchable reference.
 
+use super::admission::Ticket;
 use super::blocking::blocking;
 use super::extraction::Purpose;
 use super::{PipelineError, Service, Timings};
@@ -47,16 +48,21 @@ impl Service {
         if let Some(live) = self.maps.live(&request.map) {
             live.check_model(&request.map, &model)?;
         }
-        let content_hash = self.hash(request.image.clone()).await?;
+        let ticket = Arc::new(self.references.enter(Duration::MAX)?);
+        let content_hash = self.hash(request.image.clone(), &ticket).await?;
         if let Some(reference) = self.known(&request, content_hash).await? {
             return Ok(IngestAnswer { reference, created: false, timings: Timings::default() });
         }
-        let _ticket = self.references.enter(Duration::MAX)?;
         let mut timings = Timings::default();
-        let descriptor = self.extraction.describe(request.image, Purpose::Ingest, &mut timings).await?;
+        let descriptor = self.extraction.describe(request.image, Purpose::Ingest, &ticket, &mut timings).await?;
         let new = NewReference { map: request.map, fields: request.fields, content_hash, model, descriptor };
         let (service, started) = (self.clone(), Instant::now());
-        let committed = blocking(move || service.commit(new)).await;
+        let committed = blocking(move || {
+            let committed = service.commit(new);
+            drop(ticket);
+            committed
+        })
+        .await;
         timings.record(&self.metrics, Stage::Commit, started.elapsed());
         let inserted = committed.map_err(|_| PipelineError::Panicked { stage: "the store" })??;
         let (reference, created) = match inserted {
@@ -88,8 +94,8 @@ impl Service {
         Ok(())
     }
 
-    async fn hash(&self, image: Bytes) -> Result<ContentHash, PipelineError> {
-        let hashed = blocking(move || ContentHash::of(&image)).await;
+    async fn hash(&self, image: Bytes, ticket: &Arc<Ticket>) -> Result<ContentHash, PipelineError> {
+        let hashed = self.extraction.beside(ticket, move || ContentHash::of(&image)).await?;
         hashed.map_err(|_| PipelineError::Panicked { stage: "hashing" })
     }
 

@@ -1,7 +1,7 @@
 //! A photo to ranked places: global search, then re-ranking of the candidates (paper III-A, III-D, III-E).
 
 use super::blocking::blocking;
-use super::extraction::{Purpose, not_passed};
+use super::extraction::Purpose;
 use super::maps::LiveMap;
 use super::{PipelineError, Service, Timings, Verdict};
 use crate::error::ErrorCode;
@@ -86,25 +86,36 @@ struct Plan {
 impl Service {
     /// Answers which places of a map a photo may show.
     ///
-    /// Cancel safety: dropped while waiting, nothing further is computed.
+    /// Cancel safety: dropped while waiting, nothing further is computed; what is being computed is finished in its
+    /// place in the queue.
     pub async fn query(self: &Arc<Self>, request: QueryRequest) -> Result<QueryAnswer, PipelineError> {
         let outcome = self.answer(request).await;
+        self.count_if_late(&outcome);
+        outcome
+    }
+
+    pub(super) fn count_if_late<T>(&self, outcome: &Result<T, PipelineError>) {
         if let Err(PipelineError::DeadlineExceeded { .. }) = outcome {
             self.metrics.rejected(Rejection::Deadline);
         }
-        outcome
     }
 
     async fn answer(self: &Arc<Self>, request: QueryRequest) -> Result<QueryAnswer, PipelineError> {
         let plan = self.plan(&request.map, request.options)?;
         let patience = plan.deadline.remaining().min(self.patience());
-        not_passed(plan.deadline, "decoding")?;
-        let _ticket = self.queries.enter(patience)?;
+        let purpose = Purpose::Answer(plan.deadline);
+        purpose.not_passed("decoding")?;
+        let ticket = Arc::new(self.queries.enter(patience)?);
         let mut timings = Timings::default();
-        let descriptor = self.extraction.describe(request.image, Purpose::Answer(plan.deadline), &mut timings).await?;
-        not_passed(plan.deadline, "search")?;
+        let descriptor = self.extraction.describe(request.image, purpose, &ticket, &mut timings).await?;
+        purpose.not_passed("search")?;
         let service = self.clone();
-        let ranked = blocking(move || service.rank(&plan, &descriptor, timings)).await;
+        let ranked = blocking(move || {
+            let ranked = service.rank(&plan, &descriptor, timings);
+            drop(ticket);
+            ranked
+        })
+        .await;
         ranked.map_err(|_| PipelineError::Panicked { stage: "ranking" })?
     }
 
@@ -154,9 +165,11 @@ impl Service {
         };
         let (candidates, beyond) = neighbours.split_at(neighbours.len().min(plan.candidates));
         let (started, loading_ns) = (Instant::now(), AtomicU64::new(0));
+        // Loading runs on other threads, whose log lines belong to this request all the same.
+        let span = tracing::Span::current();
         let load = |i: usize| {
             let begun = Instant::now();
-            let loaded = self.patches.load(&*self.store, candidates[i].id);
+            let loaded = span.in_scope(|| self.patches.load(&*self.store, candidates[i].id));
             loading_ns.fetch_add(begun.elapsed().as_nanos() as u64, Ordering::Relaxed);
             loaded
         };

@@ -1,6 +1,6 @@
 //! The service: everything a request needs, and the questions that need no image.
 
-use super::admission::Admission;
+use super::admission::{Admission, Turns};
 use super::blocking::blocking;
 use super::extraction::Extraction;
 use super::maps::Maps;
@@ -15,6 +15,7 @@ use crate::store::{MapInfo, Page, PlaceStore, StoreError};
 use crate::types::{Calibration, ExternalId, ImageSize, MapName, ModelId, Reference, ReferenceId};
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::sync::Mutex;
 
 /// A running service. Shared behind an `Arc`; every method may be called from many tasks at once.
 pub struct Service {
@@ -29,6 +30,12 @@ pub struct Service {
     pub(super) queries: Arc<Admission>,
     /// The door for new references.
     pub(super) references: Arc<Admission>,
+    /// Reading the store for anything but a query.
+    pub(super) store_reads: Turns,
+    /// Changing the store for anything but a new reference.
+    pub(super) store_writes: Turns,
+    /// Held while the gauges are brought up to date.
+    pub(super) observing: Arc<Mutex<()>>,
     pub(super) memory: MemoryWatermark,
     pub(super) config: PipelineConfig,
     pub(super) metrics: Arc<Metrics>,
@@ -122,22 +129,40 @@ impl Service {
         self.metrics.set_memory(MemoryComponent::Model, self.extraction.source().memory_bytes());
         self.metrics
             .set_references(maps.iter().map(|(name, live)| (name.to_string(), live.index.len() as u64)).collect());
-        match self.read(|store| store.footprint()).await {
+        // Never more than one at the store, whoever else asks; those see what this one finds.
+        let Ok(turn) = self.observing.clone().try_lock_owned() else { return };
+        let store = self.store.clone();
+        let seen = blocking(move || {
+            let seen = (store.footprint(), store.quarantined());
+            drop(turn);
+            seen
+        });
+        let Ok((footprint, quarantined)) = seen.await else { return };
+        match footprint {
             Ok((_, engine)) => self.metrics.set_memory(MemoryComponent::Sqlite, engine),
             Err(error) => tracing::warn!(%error, "the store's footprint could not be read"),
         }
-        match self.read(|store| store.quarantined()).await {
+        match quarantined {
             Ok(records) => self.metrics.set_quarantined(records.len()),
             Err(error) => tracing::warn!(%error, "the quarantine could not be read"),
         }
     }
 
+    /// Reads the store in turn with others.
+    ///
+    /// Cancel safety: dropped while waiting, nothing is read; dropped later, the read holds its place until it ends.
     pub(super) async fn read<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&dyn PlaceStore) -> Result<T, StoreError> + Send + 'static,
     ) -> Result<T, PipelineError> {
+        let place = self.store_reads.take(self.patience()).await?;
         let service = self.clone();
-        let outcome = blocking(move || work(&*service.store)).await;
+        let outcome = blocking(move || {
+            let outcome = work(&*service.store);
+            drop(place);
+            outcome
+        })
+        .await;
         Ok(outcome.map_err(|_| PipelineError::Panicked { stage: "the store" })??)
     }
 }

@@ -1,6 +1,7 @@
 //! The seam between the pipeline and the model, so that tests of the service need no weights.
 
 use crate::extract::{ExtractError, Extractor, Head};
+use crate::image::{self, ImageConfig, ImageError};
 use crate::types::{Descriptor, ImageSize, ImageTensor, ModelId};
 
 /// What turns images into descriptors. Production uses [`Extractor`].
@@ -11,6 +12,10 @@ pub trait DescriptorSource: Send + Sync + 'static {
     fn head(&self) -> Option<&Head>;
     /// The size images must be resized to.
     fn input_size(&self) -> ImageSize;
+    /// What the model sees of an image as it was sent. Blocks for the whole computation.
+    fn decode(&self, bytes: &[u8], config: &ImageConfig) -> Result<ImageTensor, ImageError> {
+        image::load_tensor(bytes, config, self.input_size())
+    }
     /// One descriptor per image. Blocks for the whole computation.
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError>;
     /// Bytes of weights in memory.

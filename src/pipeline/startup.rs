@@ -1,6 +1,6 @@
 //! From an open store to a service: every map's index is rebuilt from the store, in parallel, with visible progress.
 
-use super::admission::Admission;
+use super::admission::{Admission, Turns};
 use super::extraction::Extraction;
 use super::maps::{LiveMap, MapEntry, Maps, Projection};
 use super::patches::PatchCache;
@@ -56,6 +56,9 @@ impl Service {
             patches: PatchCache::new(parts.pipeline.patch_cache_bytes, parts.metrics.clone()),
             queries: Admission::new(parts.pipeline.queue_capacity, parts.metrics.clone()),
             references: Admission::new(parts.pipeline.queue_capacity, parts.metrics.clone()),
+            store_reads: Turns::new(parts.pipeline.store_reads, parts.metrics.clone()),
+            store_writes: Turns::new(parts.pipeline.store_writes, parts.metrics.clone()),
+            observing: Arc::default(),
             memory: MemoryWatermark::new(parts.pipeline.memory_watermark_bytes),
             config: parts.pipeline,
             store: parts.store,

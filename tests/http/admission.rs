@@ -192,6 +192,10 @@ async fn a_full_disk_refuses_ingest_and_shows_in_readiness() {
     app.post_png("/query?map=m", 1).await.ok();
     let ready = app.get("/readyz").await;
     assert_eq!((ready.status.as_u16(), ready.json["status"].as_str()), (503, Some("disk_full")));
+    assert_eq!(app.get("/readyz?for=query").await.ok()["status"], "ready");
+    assert_eq!(app.metric("placeformer_ready").await, 1.0);
+    app.get("/readyz?for=lunch").await.problem("invalid_parameter");
+    app.get("/readyz?far=query").await.problem("invalid_parameter");
     assert_eq!(app.delete(&format!("/references/{id}")).await.status, 204);
     app.state.health.set_disk_full(false);
     app.post_png("/references?map=m", 2).await.created();
@@ -216,6 +220,8 @@ async fn before_the_service_is_loaded_it_says_so() {
     assert_eq!(get("/livez").await.status, 200);
     assert!(get("/info").await.problem("not_ready").contains("loading_model"));
     assert_eq!(get("/readyz").await.json["status"], "loading_model");
+    assert_eq!(get("/readyz?for=query").await.json["status"], "loading_model");
+    assert!(get("/metrics").await.text.contains("placeformer_ready 0"));
     health.migrating();
     assert_eq!(get("/readyz").await.json["status"], "migrating");
     health.building_index(7);

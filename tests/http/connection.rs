@@ -1,6 +1,6 @@
 //! What only a real connection shows: dawdlers, leavers, and the end of the server.
 
-use crate::support::{FakeSource, open, picture};
+use crate::support::{FakeSource, PATIENCE, open, picture};
 use placeformer::config::Config;
 use placeformer::http::serve;
 use std::net::SocketAddr;
@@ -12,9 +12,6 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 use tokio::time::{sleep, timeout};
-
-/// Longer than anything here should take.
-const PATIENCE: Duration = Duration::from_secs(30);
 
 struct Server {
     address: SocketAddr,
@@ -118,6 +115,25 @@ async fn a_body_over_the_limit_is_refused_before_it_is_sent() {
     let head = "POST /query?map=m HTTP/1.1\r\nhost: x\r\ncontent-type: image/png\r\ncontent-length: 999999999\r\n\r\n";
     let answer = server.exchange(head.as_bytes()).await;
     assert!(answer.starts_with("HTTP/1.1 413") && answer.contains("body_too_large"), "{answer}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_body_of_unknown_length_is_cut_off_at_the_limit() {
+    let server = Server::start(|config| config.image.max_bytes = 1000).await;
+    for path in ["/query?map=m", "/references?map=m"] {
+        let mut stream = server.connect().await;
+        let head =
+            format!("POST {path} HTTP/1.1\r\nhost: x\r\ncontent-type: image/png\r\ntransfer-encoding: chunked\r\n\r\n");
+        stream.write_all(head.as_bytes()).await.unwrap();
+        // The last chunk never comes: the answer must not wait for it.
+        for _ in 0..3 {
+            stream.write_all(format!("190\r\n{}\r\n", "x".repeat(0x190)).as_bytes()).await.unwrap();
+        }
+        let answer = read_all(&mut stream).await;
+        assert!(answer.starts_with("HTTP/1.1 413") && answer.contains("body_too_large"), "{answer}");
+        assert!(answer.to_ascii_lowercase().contains("connection: close"), "{answer}");
+    }
+    assert_eq!(server.source.described(), 0);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

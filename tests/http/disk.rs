@@ -2,7 +2,7 @@
 
 use crate::process::Server;
 use crate::small_disk::SmallDisk;
-use crate::support::{App, SIZE, picture};
+use crate::support::{App, FakeSource, SIZE, picture};
 use placeformer::image::{ImageConfig, load_tensor};
 use placeformer::pipeline::DescriptorSource;
 use placeformer::store::codec;
@@ -12,10 +12,7 @@ use std::time::{Duration, Instant};
 
 #[test]
 fn a_disk_that_fills_refuses_images_while_queries_and_deletions_go_on() {
-    let Some(disk) = SmallDisk::mount() else {
-        println!("skipped: this process may not mount a small file system");
-        return;
-    };
+    let Some(disk) = SmallDisk::mount() else { return };
     let server = Server::start(disk.path(), None);
     let add = |seed: u64| server.post("/references?map=m", picture(seed)).unwrap();
     let refused = |(status, answer): (u16, serde_json::Value)| {
@@ -32,6 +29,13 @@ fn a_disk_that_fills_refuses_images_while_queries_and_deletions_go_on() {
     assert!(ids.len() > 30, "only {} references fit", ids.len());
     let filler = disk.fill();
     refused(add(1_000_000));
+    // A balancer that asks for this goes on sending queries and deletions.
+    assert_eq!(server.get("/readyz?for=query").unwrap().0, 200);
+    let began = Instant::now();
+    while !server.text("/metrics").contains("\nplaceformer_disk_free_bytes 0\n") {
+        assert!(began.elapsed() < Duration::from_secs(30), "the metrics never say that nothing is free");
+        std::thread::sleep(Duration::from_millis(100));
+    }
     for (seed, id) in ids.iter().enumerate().step_by(7) {
         let (status, answer) = server.post("/query?map=m&top_k=1", picture(seed as u64)).unwrap();
         assert_eq!((status, &answer["results"][0]["reference_id"]), (200, &json!(id)), "{answer}");
@@ -64,6 +68,14 @@ fn flip(directory: &Path, bytes: &[u8]) {
     std::fs::write(path, content).unwrap();
 }
 
+/// Damages the key patches of `picture(seed)` in the closed database.
+pub fn damage_patches(directory: &Path, seed: u64) {
+    let image = load_tensor(&picture(seed), &ImageConfig::default(), SIZE).unwrap();
+    let victim = FakeSource::new("fake-1").describe(&[image]).unwrap().remove(0);
+    let blob = codec::encode(&victim.patches).unwrap();
+    flip(directory, &blob[blob.len() / 2..][..40]);
+}
+
 #[tokio::test]
 async fn damaged_patches_are_set_aside_reported_and_replaced() {
     let app = App::new();
@@ -72,12 +84,9 @@ async fn damaged_patches_are_set_aside_reported_and_replaced() {
         let answer = app.post_png(&format!("/references?map=m&external_id={seed}"), seed).await;
         ids.push(answer.created()["id"].as_str().unwrap().to_owned());
     }
-    let image = load_tensor(&picture(2), &ImageConfig::default(), SIZE).unwrap();
-    let victim = app.source.describe(&[image]).unwrap().remove(0);
     let (directory, source) = (app.directory.clone(), app.source.clone());
     drop(app);
-    let blob = codec::encode(&victim.patches).unwrap();
-    flip(directory.path(), &blob[blob.len() / 2..][..40]);
+    damage_patches(directory.path(), 2);
     let app = App::open(directory, source, |_| {});
     let answer = app.post_png("/query?map=m", 2).await;
     let places: Vec<_> = answer.ok()["results"].as_array().unwrap().iter().map(|r| r["reference_id"].clone()).collect();

@@ -6,11 +6,13 @@ mod small_disk;
 mod support;
 
 mod admission;
+mod bounds;
 mod calibration;
 mod connection;
 mod disk;
 mod errors;
 mod killed;
+mod logs;
 mod process;
 mod rehead;
 mod surface;

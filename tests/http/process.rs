@@ -4,15 +4,18 @@ use crate::support::{BACKBONE, FakeSource, head};
 use placeformer::cli::serve::{Loaders, run_server};
 use placeformer::config::Config;
 use placeformer::extract::Aggregate;
+use placeformer::ops::{LogConfig, LogFormat, logging};
 use placeformer::store::{SqliteStore, StoreConfig, crash_points};
 use serde_json::Value;
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 const DIRECTORY: &str = "PLACEFORMER_TEST_SERVED";
+/// Set: the server logs JSON.
+const LOGGED: &str = "PLACEFORMER_TEST_LOGGED";
 
 /// Settings of the store behind the server.
 pub fn store_config() -> StoreConfig {
@@ -23,6 +26,9 @@ pub fn store_config() -> StoreConfig {
 #[test]
 fn child_that_serves_until_it_is_killed() {
     let Some(directory) = std::env::var_os(DIRECTORY) else { return };
+    if std::env::var_os(LOGGED).is_some() {
+        logging::init(&LogConfig { format: LogFormat::Json, ..LogConfig::default() }).unwrap();
+    }
     let mut config = Config { store: store_config(), ..Config::default() };
     config.data.directory = directory.into();
     config.pipeline.disk_reserve_bytes = 0;
@@ -43,6 +49,8 @@ fn child_that_serves_until_it_is_killed() {
 /// The server in a process of its own.
 pub struct Server {
     child: Mutex<Child>,
+    /// Kept open: the harness in the child prints a line after a minute, and ends the process if nobody listens.
+    _output: BufReader<ChildStdout>,
     url: String,
     http: reqwest::blocking::Client,
 }
@@ -51,22 +59,40 @@ impl Server {
     /// Starts it on what is in `directory` and waits until it is ready.
     #[track_caller]
     pub fn start(directory: &Path, crash_point: Option<String>) -> Self {
+        Self::start_with(directory, |command| {
+            if let Some(point) = crash_point {
+                command.env(crash_points::VARIABLE, point);
+            }
+        })
+    }
+
+    /// As [`Server::start`], with its log as JSON in the file `log`.
+    #[track_caller]
+    pub fn start_logged(directory: &Path, log: &Path) -> Self {
+        let log = std::fs::File::create(log).unwrap();
+        Self::start_with(directory, |command| {
+            command.env(LOGGED, "1").stderr(log);
+        })
+    }
+
+    #[track_caller]
+    fn start_with(directory: &Path, change: impl FnOnce(&mut Command)) -> Self {
         let mut command = Command::new(std::env::current_exe().unwrap());
         command
             .args(["--exact", "process::child_that_serves_until_it_is_killed", "--nocapture"])
             .env(DIRECTORY, directory)
             .stdout(Stdio::piped())
             .stderr(Stdio::null());
-        if let Some(point) = crash_point {
-            command.env(crash_points::VARIABLE, point);
-        }
+        change(&mut command);
         let mut child = command.spawn().unwrap();
-        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        let url = lines.find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
+        let mut output = BufReader::new(child.stdout.take().unwrap());
+        let url =
+            output.by_ref().lines().find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
         // Fails only if one is installed already, which is as good.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let http = reqwest::blocking::Client::builder().timeout(Duration::from_secs(30)).build().unwrap();
-        let server = Self { child: Mutex::new(child), url: url.expect("the server did not start"), http };
+        let server =
+            Self { child: Mutex::new(child), _output: output, url: url.expect("the server did not start"), http };
         let began = Instant::now();
         while server.get("/readyz").is_none_or(|(status, _)| status != 200) {
             assert!(began.elapsed() < Duration::from_secs(60), "the server never became ready");
@@ -80,6 +106,11 @@ impl Server {
         read(self.http.get(format!("{}{path}", self.url)).send())
     }
 
+    /// An answer that is not JSON.
+    pub fn text(&self, path: &str) -> String {
+        self.http.get(format!("{}{path}", self.url)).send().unwrap().text().unwrap()
+    }
+
     /// As [`Server::get`], with a picture.
     pub fn post(&self, path: &str, body: Vec<u8>) -> Option<(u16, Value)> {
         let url = format!("{}{path}", self.url);
@@ -90,6 +121,12 @@ impl Server {
     pub fn put(&self, path: &str, body: Vec<u8>) -> Option<(u16, Value)> {
         let url = format!("{}{path}", self.url);
         read(self.http.put(url).header("content-type", "application/octet-stream").body(body).send())
+    }
+
+    /// As [`Server::post`], under the request id `id`.
+    pub fn post_as(&self, id: &str, path: &str, body: Vec<u8>) -> Option<(u16, Value)> {
+        let request = self.http.post(format!("{}{path}", self.url)).header("x-request-id", id);
+        read(request.header("content-type", "image/png").body(body).send())
     }
 
     /// As [`Server::get`].

@@ -9,9 +9,10 @@ use http_body_util::BodyExt;
 use placeformer::config::Config;
 use placeformer::extract::{Aggregate, ExtractError, Head};
 use placeformer::http::{AppState, app};
+use placeformer::image::{ImageConfig, ImageError, load_tensor};
 use placeformer::ops::{Health, Metrics};
 use placeformer::pipeline::{DescriptorSource, Parts, Service};
-use placeformer::store::{SqliteStore, StoreConfig};
+use placeformer::store::{PlaceStore, SqliteStore, StoreConfig};
 use placeformer::types::{
     Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid, PoolingStride,
     ScaleKeyPatches,
@@ -21,13 +22,18 @@ use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 use tempfile::TempDir;
 use tower::ServiceExt;
 
 /// Size the fake model asks for.
 pub const SIZE: ImageSize = ImageSize { width: 112, height: 84 };
+
+/// Bytes over which the fake source panics while it decodes.
+pub const BREAKS_THE_DECODER: &[u8] = b"this breaks the decoder";
+/// Bytes over which the fake source panics while it describes.
+pub const BREAKS_THE_MODEL: &[u8] = b"this breaks the model";
 
 /// Descriptors from content alone: equal images are equal, different ones as unrelated as random vectors.
 pub struct FakeSource {
@@ -36,6 +42,88 @@ pub struct FakeSource {
     /// Images described so far.
     pub described: AtomicUsize,
     delay: Mutex<Duration>,
+    pub decoding: Step,
+    pub describing: Step,
+}
+
+/// One step of the source: how many are in it, and whether they may leave.
+#[derive(Default)]
+pub struct Step {
+    pub gate: Gate,
+    inside: AtomicUsize,
+    peak: AtomicUsize,
+}
+
+impl Step {
+    fn run<T>(&self, work: impl FnOnce() -> T) -> T {
+        let _inside = Inside::enter(self);
+        self.gate.pass();
+        work()
+    }
+
+    /// Calls under way.
+    pub fn inside(&self) -> usize {
+        self.inside.load(Ordering::SeqCst)
+    }
+
+    /// Most calls ever under way at once.
+    pub fn peak(&self) -> usize {
+        self.peak.load(Ordering::SeqCst)
+    }
+}
+
+/// One call under way, also if it ends by a panic.
+struct Inside<'a>(&'a Step);
+
+impl<'a> Inside<'a> {
+    fn enter(step: &'a Step) -> Self {
+        step.peak.fetch_max(step.inside.fetch_add(1, Ordering::SeqCst) + 1, Ordering::SeqCst);
+        Self(step)
+    }
+}
+
+impl Drop for Inside<'_> {
+    fn drop(&mut self) {
+        self.0.inside.fetch_sub(1, Ordering::SeqCst);
+    }
+}
+
+/// Where threads wait while it is closed.
+#[derive(Default)]
+pub struct Gate {
+    closed: Mutex<bool>,
+    moved: Condvar,
+}
+
+impl Gate {
+    pub fn close(&self) {
+        *self.closed.lock().unwrap() = true;
+    }
+
+    pub fn open(&self) {
+        *self.closed.lock().unwrap() = false;
+        self.moved.notify_all();
+    }
+
+    /// Waits until it is open. A test that failed meanwhile opens nothing, and must end all the same.
+    pub fn pass(&self) {
+        let closed = self.closed.lock().unwrap();
+        drop(self.moved.wait_timeout_while(closed, 2 * PATIENCE, |closed| *closed).unwrap());
+    }
+}
+
+/// Longer than anything here should take.
+pub const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Waits until `condition` holds.
+pub fn until(what: &str, condition: impl Fn() -> bool) -> impl Future<Output = ()> {
+    let (what, began) = (what.to_owned(), std::time::Instant::now());
+    async move {
+        while !condition() {
+            assert!(began.elapsed() < PATIENCE, "{what} never came about");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    }
 }
 
 impl FakeSource {
@@ -50,7 +138,14 @@ impl FakeSource {
     }
 
     fn made(model: ModelId, head: Option<Head>) -> Arc<Self> {
-        Arc::new(Self { model, head, described: AtomicUsize::new(0), delay: Mutex::default() })
+        Arc::new(Self {
+            model,
+            head,
+            described: AtomicUsize::new(0),
+            delay: Mutex::default(),
+            decoding: Step::default(),
+            describing: Step::default(),
+        })
     }
 
     /// Lets every further description take this long.
@@ -76,15 +171,26 @@ impl DescriptorSource for FakeSource {
         SIZE
     }
 
+    fn decode(&self, bytes: &[u8], config: &ImageConfig) -> Result<ImageTensor, ImageError> {
+        self.decoding.run(|| match bytes {
+            BREAKS_THE_DECODER => panic!("planted in the decoder"),
+            BREAKS_THE_MODEL => Ok(ImageTensor { size: SIZE, data: vec![f32::NAN; 3 * 112 * 84] }),
+            _ => load_tensor(bytes, config, SIZE),
+        })
+    }
+
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
-        self.described.fetch_add(images.len(), Ordering::SeqCst);
-        let delay = *self.delay.lock().unwrap();
-        std::thread::sleep(delay);
-        let mut descriptors: Vec<Descriptor> = images.iter().map(describe).collect();
-        if let Some(head) = &self.head {
-            descriptors.iter_mut().for_each(|descriptor| descriptor.global = head.project(&descriptor.pooled));
-        }
-        Ok(descriptors)
+        self.describing.run(|| {
+            self.described.fetch_add(images.len(), Ordering::SeqCst);
+            assert!(images.iter().all(|image| !image.data[0].is_nan()), "planted in the model");
+            let delay = *self.delay.lock().unwrap();
+            std::thread::sleep(delay);
+            let mut descriptors: Vec<Descriptor> = images.iter().map(describe).collect();
+            if let Some(head) = &self.head {
+                descriptors.iter_mut().for_each(|descriptor| descriptor.global = head.project(&descriptor.pooled));
+            }
+            Ok(descriptors)
+        })
     }
 
     fn memory_bytes(&self) -> u64 {
@@ -147,11 +253,22 @@ impl App {
     }
 
     pub fn open(directory: Arc<TempDir>, source: Arc<FakeSource>, change: impl FnOnce(&mut Config)) -> Self {
+        Self::around(|store| Arc::new(store), directory, source, change)
+    }
+
+    /// With a store of the test's own around the real one.
+    pub fn around(
+        wrap: impl FnOnce(SqliteStore) -> Arc<dyn PlaceStore>,
+        directory: Arc<TempDir>,
+        source: Arc<FakeSource>,
+        change: impl FnOnce(&mut Config),
+    ) -> Self {
         let store = StoreConfig { reserve_bytes: 1 << 20, ..Default::default() };
         let mut config = Config { store, ..Default::default() };
         config.pipeline.disk_reserve_bytes = 0;
         change(&mut config);
-        let (state, service) = open(directory.path(), source.clone(), config);
+        let store = wrap(SqliteStore::open(directory.path(), &config.store).unwrap());
+        let (state, service) = start(store, source.clone(), config);
         state.open(service);
         Self { router: app(state.clone()), state, source, directory }
     }
@@ -180,6 +297,27 @@ impl App {
         self.send(Request::put(path).header("content-type", kind).body(body.into()).unwrap()).await
     }
 
+    /// Sends bytes as a JPEG.
+    pub async fn post_bytes(&self, path: &str, bytes: &[u8]) -> Answer {
+        self.post(path, "image/jpeg", bytes.to_vec()).await
+    }
+
+    /// The value of a series, as the metrics show it.
+    pub async fn metric(&self, series: &str) -> f64 {
+        let text = self.get("/metrics").await.text;
+        let value = text.lines().find_map(|line| line.strip_prefix(series)?.trim().parse().ok());
+        value.unwrap_or_else(|| panic!("{series} is missing in\n{text}"))
+    }
+
+    /// Waits until nobody is left in the queue.
+    pub async fn drained(&self) {
+        let began = std::time::Instant::now();
+        while self.metric("placeformer_queue_depth").await > 0.0 {
+            assert!(began.elapsed() < PATIENCE, "the queue never emptied");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    }
+
     pub async fn patch(&self, path: &str, body: &Value) -> Answer {
         let request = Request::patch(path).header("content-type", "application/json");
         self.send(request.body(Body::from(body.to_string())).unwrap()).await
@@ -193,10 +331,13 @@ impl App {
 
 /// The state of a server and its service, not yet opened.
 pub fn open(directory: &Path, source: Arc<dyn DescriptorSource>, config: Config) -> (AppState, Arc<Service>) {
+    start(Arc::new(SqliteStore::open(directory, &config.store).unwrap()), source, config)
+}
+
+fn start(store: Arc<dyn PlaceStore>, source: Arc<dyn DescriptorSource>, config: Config) -> (AppState, Arc<Service>) {
     let (metrics, health) = (Arc::new(Metrics::new().unwrap()), Arc::new(Health::default()));
     let limit = config.image.max_bytes;
     let state = AppState::new(config.http.clone(), &config.auth, limit, metrics.clone(), health.clone()).unwrap();
-    let store = Arc::new(SqliteStore::open(directory, &config.store).unwrap());
     let Config { image, rerank, pipeline, .. } = config;
     let service = Service::start(Parts { store, source, image, rerank, pipeline, metrics, health }).unwrap();
     (state, service)

@@ -6,6 +6,7 @@ use crate::http::body::read_upload;
 use crate::http::problem::ApiError;
 use crate::pipeline::{MatchSide, Matched};
 use crate::rerank::CombinationMatch;
+use crate::types::ReferenceId;
 use axum::extract::{Request, State};
 use axum::response::Response;
 use serde::{Deserialize, Serialize};
@@ -21,6 +22,13 @@ pub struct MatchParams {
     #[schema(format = Uuid)]
     #[param(format = Uuid)]
     pub reference_id: Option<String>,
+}
+
+impl MatchParams {
+    /// Checks what the types cannot.
+    pub fn checked(self) -> Result<Option<ReferenceId>, ApiError> {
+        Ok(self.reference_id.as_deref().map(str::parse).transpose()?)
+    }
 }
 
 /// Correspondences and homographies of a pair.
@@ -91,9 +99,10 @@ pub async fn match_images(State(state): State<AppState>, request: Request) -> Re
     let service = state.service()?;
     let mut upload = read_upload::<MatchParams>(&state, request, &["query", "reference"]).await?;
     let query = upload.take("query")?;
-    let other = match (upload.take_optional("reference")?, upload.params.reference_id.take()) {
+    let reference_id = std::mem::take(&mut upload.params).checked()?;
+    let other = match (upload.take_optional("reference")?, reference_id) {
         (Some(image), None) => MatchSide::Image(image),
-        (None, Some(id)) => MatchSide::Reference(id.parse()?),
+        (None, Some(id)) => MatchSide::Reference(id),
         _ => return Err(ApiError::invalid("give either the image \"reference\" or reference_id")),
     };
     let answer = service.match_images(query, other).await?;

@@ -2,14 +2,15 @@
 
 use crate::error::ErrorCode;
 use crate::http::AppState;
+use crate::http::body::read_query;
 use crate::http::problem::{ApiError, OwnBody};
 use crate::ops::{Metrics, Unready};
 use axum::extract::State;
-use axum::http::{StatusCode, header};
+use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
-use serde::Serialize;
-use utoipa::ToSchema;
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
 /// A sign of life.
 #[derive(Debug, Serialize, ToSchema)]
@@ -48,15 +49,46 @@ pub async fn livez() -> Json<LiveBody> {
     Json(LiveBody { status: "live" })
 }
 
+/// What is asked about.
+#[derive(Debug, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct ReadyParams {
+    /// `query`: only whether queries, listings and deletions are answered, which they are on a full disk, too. Left
+    /// out: also whether new references are taken.
+    #[serde(rename = "for")]
+    #[param(rename = "for", inline)]
+    purpose: Option<ReadyFor>,
+}
+
+/// A part of the service that may be ready alone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+enum ReadyFor {
+    /// All that a full disk leaves.
+    Query,
+}
+
 /// Can it take requests?
 ///
-/// 503 with the reason while it cannot; send requests elsewhere meanwhile, do not restart it.
-#[utoipa::path(get, path = "/readyz", tag = "service", responses(
+/// 503 with the reason while it cannot; send requests elsewhere meanwhile, do not restart it. A balancer should ask
+/// `/readyz?for=query`: a full disk (`disk_full`) keeps a server from storing, which it answers with 507 itself, but
+/// not from answering queries and deleting.
+#[utoipa::path(get, path = "/readyz", tag = "service", params(ReadyParams), responses(
     (status = 200, description = "It can.", body = ReadyBody),
     (status = 503, description = "It cannot: `status` says why.", body = ReadyBody),
 ))]
-pub async fn readyz(State(state): State<AppState>) -> Response {
-    let Some(reason) = state.health.unready() else {
+pub async fn readyz(State(state): State<AppState>, uri: Uri) -> Result<Response, ApiError> {
+    let params: ReadyParams = read_query(&uri)?;
+    let unready = match params.purpose {
+        Some(ReadyFor::Query) => state.health.unready_for_queries(),
+        None => state.health.unready(),
+    };
+    Ok(answer(unready))
+}
+
+fn answer(unready: Option<Unready>) -> Response {
+    let Some(reason) = unready else {
         return Json(ReadyBody { status: "ready", progress: None }).into_response();
     };
     let progress = match reason {
@@ -74,6 +106,7 @@ pub async fn readyz(State(state): State<AppState>) -> Response {
     (status = 200, description = "All series.", body = String, content_type = "text/plain"),
 ))]
 pub async fn metrics(State(state): State<AppState>) -> Result<Response, ApiError> {
+    state.metrics.set_ready(state.health.unready_for_queries().is_none());
     if let Some(service) = state.started() {
         service.observe().await;
     }

@@ -60,7 +60,36 @@ pub struct QueryParams {
     pub deadline_ms: Option<u64>,
 }
 
+/// Parameters of a query, each in its range.
+#[derive(Debug)]
+pub struct CheckedQuery {
+    /// The map to look in.
+    pub map: MapName,
+    /// How to answer, but for the deadline.
+    pub options: QueryOptions,
+    /// Time for the answer, if the client says.
+    pub budget: Option<Duration>,
+}
+
 impl QueryParams {
+    /// Checks what the types cannot; the counts are checked by the pipeline, which knows their bounds.
+    pub fn checked(self) -> Result<CheckedQuery, ApiError> {
+        let filter = ReferenceFilter {
+            near: self.near()?,
+            captured_after: self.captured_after,
+            captured_before: self.captured_before,
+        };
+        if self.deadline_ms == Some(0) {
+            return Err(ApiError::invalid("deadline_ms: it must be at least 1"));
+        }
+        let (top_k, candidates, rerank) = (self.top_k, self.candidates, self.rerank);
+        Ok(CheckedQuery {
+            map: self.map.ok_or_else(|| ApiError::invalid("map: it is required"))?,
+            options: QueryOptions { top_k, candidates, rerank, filter, deadline: None },
+            budget: self.deadline_ms.map(Duration::from_millis),
+        })
+    }
+
     fn near(&self) -> Result<Option<GeoCircle>, ApiError> {
         match (&self.near, self.radius_m) {
             (Some(near), Some(radius_m)) => Ok(Some(GeoCircle::new(parse_point(near)?, radius_m)?)),
@@ -167,30 +196,11 @@ pub async fn query(State(state): State<AppState>, request: Request) -> Result<Re
     let service = state.service()?;
     let mut upload = read_upload::<QueryParams>(&state, request, &["image"]).await?;
     let image = upload.take("image")?;
-    let params = std::mem::take(&mut upload.params);
-    let near = params.near()?;
-    let map = params.map.ok_or_else(|| ApiError::invalid("map: it is required"))?;
-    let options = QueryOptions {
-        top_k: params.top_k,
-        candidates: params.candidates,
-        rerank: params.rerank,
-        filter: ReferenceFilter {
-            near,
-            captured_after: params.captured_after,
-            captured_before: params.captured_before,
-        },
-        deadline: Some(deadline(params.deadline_ms, service.config().deadline_ms, arrived)?),
-    };
+    let CheckedQuery { map, mut options, budget } = std::mem::take(&mut upload.params).checked()?;
+    let most = Duration::from_millis(service.config().deadline_ms);
+    options.deadline = Some(Deadline::after(budget.unwrap_or(most).min(most).saturating_sub(arrived.elapsed())));
     let answer = service.query(QueryRequest { map, image, options }).await?;
     Ok(respond(answer))
-}
-
-fn deadline(asked_ms: Option<u64>, most_ms: u64, arrived: std::time::Instant) -> Result<Deadline, ApiError> {
-    if asked_ms == Some(0) {
-        return Err(ApiError::invalid("deadline_ms: it must be at least 1"));
-    }
-    let budget = Duration::from_millis(asked_ms.unwrap_or(most_ms).min(most_ms));
-    Ok(Deadline::after(budget.saturating_sub(arrived.elapsed())))
 }
 
 fn respond(answer: QueryAnswer) -> Response {

@@ -60,7 +60,8 @@ pub struct ReferenceParams {
 }
 
 impl ReferenceParams {
-    fn checked(self) -> Result<(MapName, ReferenceFields), ApiError> {
+    /// Checks what the types cannot.
+    pub fn checked(self) -> Result<(MapName, ReferenceFields), ApiError> {
         let map = self.map.ok_or_else(|| ApiError::invalid("map: it is required"))?;
         let fields = ReferenceFields {
             external_id: self.external_id,
@@ -122,6 +123,38 @@ pub struct ListParams {
     limit: Option<usize>,
 }
 
+/// What a listing asks for, each in its range.
+#[derive(Debug, PartialEq)]
+pub enum Listing {
+    /// The one reference with this external id.
+    Named(MapName, ExternalId),
+    /// A page of a map, or of all.
+    Page {
+        /// Only this map.
+        map: Option<MapName>,
+        /// Starting behind this one.
+        after: Option<ReferenceId>,
+        /// References in the page.
+        limit: usize,
+    },
+}
+
+impl ListParams {
+    /// Checks what the types cannot; a page has at most `max_page` references.
+    pub fn checked(self, max_page: usize) -> Result<Listing, ApiError> {
+        let limit = self.limit.unwrap_or(DEFAULT_PAGE.min(max_page));
+        if !(1..=max_page).contains(&limit) {
+            return Err(ApiError::invalid(format!("limit: {limit} is outside 1 to {max_page}")));
+        }
+        let after = self.cursor.as_deref().map(str::parse).transpose()?;
+        match (self.map, self.external_id) {
+            (Some(map), Some(external_id)) => Ok(Listing::Named(map, external_id)),
+            (None, Some(_)) => Err(ApiError::invalid("external_id: it needs map")),
+            (map, None) => Ok(Listing::Page { map, after, limit }),
+        }
+    }
+}
+
 /// A page of references.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct ReferencePage {
@@ -138,19 +171,16 @@ pub struct ReferencePage {
     (status = 200, description = "A page.", body = ReferencePage),
 ))]
 pub async fn list(State(state): State<AppState>, uri: Uri) -> Result<Json<ReferencePage>, ApiError> {
-    let params: ListParams = read_query(&uri)?;
-    let limit = params.limit.unwrap_or(DEFAULT_PAGE.min(state.http.max_page));
-    if !(1..=state.http.max_page).contains(&limit) {
-        return Err(ApiError::invalid(format!("limit: {limit} is outside 1 to {}", state.http.max_page)));
-    }
-    let after = params.cursor.as_deref().map(str::parse::<ReferenceId>).transpose()?;
+    let listing = read_query::<ListParams>(&uri)?.checked(state.http.max_page)?;
     let service = state.service()?;
-    if let Some(external_id) = params.external_id {
-        let map = params.map.ok_or_else(|| ApiError::invalid("external_id: it needs map"))?;
-        let found = service.find_external(map, external_id).await?;
-        return Ok(Json(ReferencePage { references: found.into_iter().map(Into::into).collect(), next: None }));
-    }
-    let page = service.references(params.map, after, limit).await?;
+    let (map, after, limit) = match listing {
+        Listing::Named(map, external_id) => {
+            let found = service.find_external(map, external_id).await?;
+            return Ok(Json(ReferencePage { references: found.into_iter().map(Into::into).collect(), next: None }));
+        }
+        Listing::Page { map, after, limit } => (map, after, limit),
+    };
+    let page = service.references(map, after, limit).await?;
     Ok(Json(ReferencePage {
         references: page.references.into_iter().map(Into::into).collect(),
         next: page.next.map(|id| id.to_string()),
