@@ -12,6 +12,11 @@ fn lines(log: &Path) -> Vec<Value> {
     text.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("not JSON: {line}"))).collect()
 }
 
+const BROKEN: &str = "a blocking task failed";
+
+/// Request id, path, body, expected status, and lines that must be logged beside "answered".
+type Case = (&'static str, &'static str, Vec<u8>, u16, &'static [&'static str]);
+
 #[test]
 fn every_line_of_a_request_carries_its_id_whatever_thread_it_comes_from() {
     let directory = Arc::new(tempfile::tempdir().unwrap());
@@ -27,8 +32,7 @@ fn every_line_of_a_request_carries_its_id_whatever_thread_it_comes_from() {
     let server = Server::start_logged(directory.path(), &log);
     let mut seen = lines(&log).len();
     assert!(seen > 0, "the start is logged");
-    let broken = "a blocking task failed";
-    let cases: [(&str, &str, Vec<u8>, u16, &[&str]); 4] = [
+    let cases: [Case; 4] = [
         ("adds", "/references?map=m", picture(9), 201, &[]),
         (
             "meets-damage",
@@ -37,13 +41,13 @@ fn every_line_of_a_request_carries_its_id_whatever_thread_it_comes_from() {
             200,
             &["a stored reference is damaged; it is quarantined", "a stored record is damaged; it is no longer served"],
         ),
-        ("breaks-decoder", "/query?map=m", BREAKS_THE_DECODER.to_vec(), 422, &["a thread panicked", broken]),
+        ("breaks-decoder", "/query?map=m", BREAKS_THE_DECODER.to_vec(), 422, &["a thread panicked", BROKEN]),
         (
             "breaks-model",
             "/query?map=m",
             BREAKS_THE_MODEL.to_vec(),
             500,
-            &["a thread panicked", broken, "request failed"],
+            &["a thread panicked", BROKEN, "request failed"],
         ),
     ];
     for (id, path, body, status, expected) in cases {
