@@ -37,7 +37,7 @@ pub(super) fn locate(folder: &Path, sides: [&mut [Item]; 2]) -> Result<(), EvalE
     let zones = Zones::of(rows.values().filter_map(|(place, _)| Some((*place)?.0)));
     for item in sides.into_iter().flatten() {
         if let Some(&(place, heading)) = rows.get(&relative_name(folder, &item.path)) {
-            item.position = place.and_then(|(zone, geo)| zones.from_geo(zone, geo));
+            item.position = place.and_then(|(zone, geo)| zones.locate(zone, geo));
             item.group = place.and_then(|(zone, _)| zones.group(zone));
             item.heading = heading;
         }

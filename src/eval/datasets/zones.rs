@@ -50,7 +50,7 @@ impl Zones {
     }
 
     /// The plane coordinates of a position of `zone` in its cluster.
-    pub(super) fn from_geo(&self, zone: UtmZone, position: GeoPoint) -> Option<MetricPoint> {
+    pub(super) fn locate(&self, zone: UtmZone, position: GeoPoint) -> Option<MetricPoint> {
         Some(self.cluster(zone)?.target().from_geo(position))
     }
 
