@@ -1,8 +1,8 @@
 //! Inspect and delete maps of a running server; give maps in a data directory another head.
 
 use super::client::{ServerArgs, ServerClient};
+use crate::config::{Config, Overrides};
 use crate::extract::Head;
-use crate::store::StoreConfig;
 use crate::types::MapName;
 use anyhow::{Context, ensure};
 use clap::Subcommand;
@@ -65,6 +65,9 @@ enum Action {
         /// Data directory of the stopped server.
         #[arg(long, value_name = "DIR")]
         data: PathBuf,
+        /// Settings of the store, as the server reads them (TOML).
+        #[arg(long, env = "PLACEFORMER_CONFIG", value_name = "FILE")]
+        config: Option<PathBuf>,
     },
 }
 
@@ -78,7 +81,7 @@ pub fn run(args: MapArgs) -> anyhow::Result<()> {
             Ok(())
         }
         Action::Delete { map, yes, server } => delete(&ServerClient::new(server)?, &map, yes),
-        Action::Rehead { maps, head, data } => rehead(&maps, &head, &data),
+        Action::Rehead { maps, head, data, config } => rehead(&maps, &head, &data, config.as_deref()),
     }
 }
 
@@ -112,10 +115,11 @@ fn confirmed(map: &MapName, references: &Value) -> io::Result<bool> {
     Ok(line.trim() == map.as_str())
 }
 
-fn rehead(maps: &[MapName], head: &Path, data: &Path) -> anyhow::Result<()> {
+fn rehead(maps: &[MapName], head: &Path, data: &Path, config: Option<&Path>) -> anyhow::Result<()> {
+    let config = Config::load(config, &Overrides::default())?;
     let head = Head::load(head)?;
     ensure!(data.is_dir(), "there is no store in {}", data.display());
-    let store = super::serve::open_store(data, &StoreConfig::default())?;
+    let store = super::serve::open_store(data, &config.store)?;
     // All are looked at before any is changed.
     let mut plan = Vec::new();
     for map in maps {

@@ -87,7 +87,12 @@ impl Service {
         let map: MapName = reference.map;
         self.maps.comparable(&map, self.extraction.source().model_id())?;
         let service = self.clone();
-        let loaded = blocking(move || service.patches.load(&*service.store, id)).await;
+        let loaded = blocking(move || {
+            let loaded = service.patches.load(&*service.store, id);
+            service.follow_damage();
+            loaded
+        })
+        .await;
         Ok(loaded.map_err(|_| PipelineError::Panicked { stage: "the store" })??)
     }
 }

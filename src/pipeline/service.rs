@@ -7,6 +7,7 @@ use super::maps::Maps;
 use super::patches::PatchCache;
 use super::trust::Trust;
 use super::{PipelineConfig, PipelineError};
+use crate::error::ErrorCode;
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::metrics::MemoryComponent;
 use crate::ops::{Health, Metrics};
@@ -131,12 +132,40 @@ impl Service {
         }
     }
 
+    /// Counts damage that the store has met, and stops searching for what it no longer serves.
+    pub(super) fn follow_damage(&self) {
+        let damage = self.store.drain_damage();
+        self.metrics.corrupt_records(damage.found);
+        if damage.withdrawn.is_empty() {
+            return;
+        }
+        for (_, live) in self.maps.all() {
+            for &id in &damage.withdrawn {
+                live.index.remove(id);
+            }
+        }
+        damage.withdrawn.iter().for_each(|&id| self.patches.forget(id));
+    }
+
+    /// A map that cannot be searched does not exist, or its record is damaged.
+    pub(super) async fn why_no_map(self: &Arc<Self>, name: MapName) -> PipelineError {
+        match self.map(name.clone()).await {
+            Err(error) if error.code() == ErrorCode::CorruptRecord => error,
+            _ => PipelineError::MapNotFound(name),
+        }
+    }
+
     pub(super) async fn read<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&dyn PlaceStore) -> Result<T, StoreError> + Send + 'static,
     ) -> Result<T, PipelineError> {
         let service = self.clone();
-        let outcome = blocking(move || work(&*service.store)).await;
+        let outcome = blocking(move || {
+            let outcome = work(&*service.store);
+            service.follow_damage();
+            outcome
+        })
+        .await;
         Ok(outcome.map_err(|_| PipelineError::Panicked { stage: "the store" })??)
     }
 }

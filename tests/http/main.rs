@@ -8,6 +8,7 @@ mod support;
 mod admission;
 mod calibration;
 mod connection;
+mod damage;
 mod disk;
 mod errors;
 mod killed;

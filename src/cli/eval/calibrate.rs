@@ -70,7 +70,7 @@ pub(super) fn run(args: CalibrateArgs) -> anyhow::Result<()> {
     args.rerank.check()?;
     let dataset = args.data.load()?;
     let extract = args.model.extract_config()?;
-    let described = Described::new(&args.model, &extract, &args.output.cache, &dataset, GlobalKind::Head)?;
+    let described = Described::new(&extract, &args.output.cache, &dataset, GlobalKind::Head)?;
     let answers = best_answers(&args, &dataset, &described)?;
     let fitted = calibrate(
         &answers,

