@@ -17,9 +17,12 @@ pub struct MatchArgs {
     query: PathBuf,
     /// Reference image.
     reference: PathBuf,
-    /// Draw both images, their attention and key patches, and the inliers, as PNG or JPEG.
-    #[arg(long, value_name = "FILE")]
-    out: Option<PathBuf>,
+    /// Where both images, their attention and key patches, and the inliers are drawn, as PNG or JPEG.
+    #[arg(long, value_name = "FILE", default_value = "match.png")]
+    out: PathBuf,
+    /// Draw nothing.
+    #[arg(long, conflicts_with = "out")]
+    no_picture: bool,
     /// Print the correspondences and homographies as JSON.
     #[arg(long)]
     json: bool,
@@ -35,7 +38,7 @@ pub fn run(args: MatchArgs) -> anyhow::Result<()> {
     let rerank = RerankConfig { scales: args.scales.clone(), ..Default::default() };
     rerank.check()?;
     crate::kernels::self_check()?;
-    let encode = args.out.as_deref().map(encoder).transpose()?;
+    let encode = if args.no_picture { None } else { Some(encoder(&args.out)?) };
     let extractor = Extractor::open(&args.model.extract_config()?)?;
     let limits = ImageConfig::default();
     let see = |path: &Path| {
@@ -50,7 +53,8 @@ pub fn run(args: MatchArgs) -> anyhow::Result<()> {
     } else {
         print_counts(&query, &reference, &matches);
     }
-    if let (Some(path), Some(encode)) = (&args.out, encode) {
+    if let Some(encode) = encode {
+        let path = &args.out;
         let bytes = encode(&picture(&query, &reference, &matches)?)?;
         std::fs::write(path, bytes).with_context(|| format!("cannot write {}", path.display()))?;
         eprintln!("wrote {}", path.display());

@@ -11,7 +11,7 @@ use super::trace::ExtractionTrace;
 use super::weights::VitWeights;
 use super::{fusion, model_id, positions, pull, record, selection};
 use crate::kernels;
-use crate::types::{Descriptor, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid};
+use crate::types::{Descriptor, ImageSize, ImageTensor, InvalidValue, KeyPatches, ModelId, PackedPatches, PatchGrid};
 use std::path::Path;
 
 /// A loaded model with its head.
@@ -65,6 +65,17 @@ impl Extractor {
             backbone,
             model_id,
         })
+    }
+
+    /// The same model computed by another encoder, such as the plain one that the fused one is tested against.
+    ///
+    /// # Errors
+    /// One that computes something else than the settings say.
+    pub fn with_encoder(self, encoder: Box<dyn Encoder>) -> Result<Self, ExtractError> {
+        if encoder.spec() != self.encoder.spec() {
+            return Err(InvalidValue::new("encoder", format!("it computes {:?}", encoder.spec())).into());
+        }
+        Ok(Self { encoder, ..self })
     }
 
     /// What its descriptors may be compared with.

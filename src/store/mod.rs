@@ -218,7 +218,7 @@ pub trait PlaceStore: Send + Sync {
     /// What damage was met since the last call, so that it can be counted and an index follow. Cheap where there is none.
     fn drain_damage(&self) -> Damage;
     /// Writes a consistent copy of everything to a new file while the store is in use; returns its size in bytes.
-    /// Put in a data directory under the database's name (`placeformer.db`) it is a store again.
+    /// Put in a data directory under the database's name ([`SqliteStore::DATABASE`]) it is a store again.
     fn backup(&self, target: &Path) -> Result<u64, StoreError>;
     /// Reads everything, checks every checksum, quarantines what is damaged.
     fn verify(&self) -> Result<VerifyReport, StoreError>;

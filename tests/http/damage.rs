@@ -76,7 +76,7 @@ async fn one_unreadable_page_costs_only_the_references_on_it() {
         std::fs::write(database(directory.path()), damaged).unwrap();
         let app = open(&directory);
         let mut served = 0;
-        let asked: Vec<(u64, &String)> = (0..).zip(&ids).filter(|(seed, _)| seed % 50 == 0 || *seed >= 196).collect();
+        let asked: Vec<(u64, &String)> = (0..).zip(&ids).filter(|(seed, _)| seed % 20 == 0 || *seed == 199).collect();
         for &(seed, id) in &asked {
             // A reference leaves the index when it is first met, so the second answer is the steady one.
             app.post_png("/query?map=m&top_k=1", seed).await;
@@ -86,7 +86,7 @@ async fn one_unreadable_page_costs_only_the_references_on_it() {
         // No query needs the pooled vectors.
         let whole = table == "pooled_vector";
         assert_eq!(served == asked.len(), whole, "{table}: {served} of {} are served", asked.len());
-        assert!(served >= asked.len() / 2, "{table}: only {served} of {} are served", asked.len());
+        assert!(served * 3 >= asked.len(), "{table}: only {served} of {} are served", asked.len());
         assert!(listed >= 100, "{table}: only {listed} are listed");
         assert_eq!(metric(&app, "placeformer_corrupt_records_total").await > 0, !whole, "{table}");
     }

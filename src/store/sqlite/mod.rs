@@ -72,6 +72,16 @@ impl SqliteStore {
         Ok(Self { writer, readers, quarantine, path, config: config.clone(), _directory: claimed })
     }
 
+    /// Name of the database inside a data directory.
+    pub const DATABASE: &str = directory::DATABASE;
+
+    /// As [`PlaceStore::backup`], of the store in a directory that another process may have open: only its database is
+    /// read. `target` must not exist.
+    pub fn backup_of(directory: &Path, config: &StoreConfig, target: &Path) -> Result<u64, StoreError> {
+        let path = directory.join(directory::DATABASE);
+        backup::write(&engine::open_reader(&path, config)?, target)
+    }
+
     /// Takes a damaged reference out of service and records why.
     fn put_in_quarantine(&self, number: i64, map: i64, id: ReferenceId, reason: &str) {
         if !self.quarantine.add(number, map, id, reason) {
