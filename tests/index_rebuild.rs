@@ -15,7 +15,7 @@ use placeformer::types::{
     ContentHash, GLOBAL_DIM, GeoCircle, GeoPoint, MapName, NewReference, Reference, ReferenceFields, ReferenceFilter,
     ReferenceId,
 };
-use places::{map, reference, unit_vector};
+use places::{map, named_reference, reference, unit_vector};
 use proptest::prelude::*;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -220,8 +220,7 @@ impl History {
 
     /// All references of a map that pass the filter, nearest first; which ones, the model says.
     async fn search(&self, map: &MapName, filter: ReferenceFilter) -> Vec<(ReferenceId, f32)> {
-        let options =
-            QueryOptions { top_k: Some(1000), rerank: Some(false), filter: filter.clone(), ..Default::default() };
+        let options = QueryOptions { top_k: Some(1000), rerank: Some(false), filter, ..Default::default() };
         let request = QueryRequest { map: map.clone(), image: Bytes::from(picture(2)), options };
         let answer = self.service().query(request).await.unwrap();
         let passes = |fields: &ReferenceFields| filter.accepts(fields.location, fields.captured_at);
@@ -317,7 +316,11 @@ fn rebuilt_equals_live_across_many_blocks() {
     let store = open(directory.path());
     let city = map("city");
     let live = MapIndex::default();
-    let new: Vec<NewReference> = (0..9000).map(|seed| reference(&city, seed)).collect();
+    let made = |seed: u64| match seed % 2 {
+        0 => reference(&city, seed),
+        _ => named_reference(&city, &format!("photo {seed}"), seed),
+    };
+    let new: Vec<NewReference> = (0..9000).map(made).collect();
     let mut ids = Vec::new();
     for (outcome, new) in store.insert_many(new.clone()).into_iter().zip(&new) {
         let Ok(Inserted::Created(created)) = outcome else { panic!("{outcome:?}") };
