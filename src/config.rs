@@ -7,7 +7,7 @@
 //! An environment variable names its key with `__` between the levels: `PLACEFORMER_HTTP__LISTEN=0.0.0.0:80` is
 //! `listen` of `[http]`.
 
-use crate::extract::ExtractConfig;
+use crate::extract::{ExtractConfig, HeadChoice, Precision, Preset};
 use crate::http::{AuthConfig, HttpConfig};
 use crate::image::ImageConfig;
 use crate::ops::LogConfig;
@@ -82,6 +82,27 @@ pub struct Overrides {
     /// Log filter, such as `info` or `placeformer=debug`.
     #[arg(long, value_name = "FILTER")]
     pub log: Option<String>,
+    /// The model.
+    #[command(flatten)]
+    pub model: ModelOverrides,
+}
+
+/// The model of a service, given on the command line.
+#[derive(Debug, Clone, Default, PartialEq, clap::Args)]
+#[command(next_help_heading = "Model")]
+pub struct ModelOverrides {
+    /// Backbone: dinov2-vits14, dinov2-vitb14, dinov2-vitl14 or placeformer-vits16.
+    #[arg(long, value_name = "NAME")]
+    pub preset: Option<Preset>,
+    /// Weights file for the backbone, such as `train` writes; its published ones are pulled on first use otherwise.
+    #[arg(long, env = "PLACEFORMER_WEIGHTS", value_name = "FILE")]
+    pub weights: Option<PathBuf>,
+    /// Projection to the global descriptor: default, or a file.
+    #[arg(long, value_name = "HEAD")]
+    pub head: Option<HeadChoice>,
+    /// Arithmetic of the transformer: auto (f32), f32, bf16 or int8.
+    #[arg(long, value_name = "NAME")]
+    pub precision: Option<Precision>,
 }
 
 /// Why the settings cannot be used.
@@ -109,6 +130,15 @@ pub enum ConfigError {
     /// A value is out of range.
     #[error("the configuration is not valid: {0}")]
     Value(#[from] InvalidValue),
+    /// A setting of the model breaks its rule.
+    #[error("the configuration is not valid: extract.{0}")]
+    Extract(#[source] InvalidValue),
+    /// Without a head there is no global descriptor to search by.
+    #[error(
+        "the configuration is not valid: extract.head: a service cannot run with \"none\", because maps are searched by \
+         the head's output; leave it at \"default\" or name a file (`placeformer head fit` makes one)"
+    )]
+    NoHead,
     /// The log filter cannot be parsed.
     #[error(transparent)]
     Filter(#[from] crate::ops::logging::InvalidFilter),
@@ -135,22 +165,34 @@ impl Config {
     }
 
     fn apply(&mut self, overrides: &Overrides) {
-        let Overrides { listen, data, log_format, log } = overrides.clone();
+        let Overrides { listen, data, log_format, log, model } = overrides.clone();
         self.http.listen = listen.unwrap_or_else(|| std::mem::take(&mut self.http.listen));
         self.data.directory = data.unwrap_or_else(|| std::mem::take(&mut self.data.directory));
         self.log.format = log_format.unwrap_or(self.log.format);
         self.log.filter = log.unwrap_or_else(|| std::mem::take(&mut self.log.filter));
+        let ModelOverrides { preset, weights, head, precision } = model;
+        self.extract.preset = preset.unwrap_or(self.extract.preset);
+        self.extract.weights = weights.or_else(|| self.extract.weights.take());
+        self.extract.head = head.unwrap_or_else(|| std::mem::take(&mut self.extract.head));
+        self.extract.precision = precision.unwrap_or(self.extract.precision);
     }
 
     fn check(&self) -> Result<(), ConfigError> {
         self.http.check()?;
         self.auth.check()?;
         self.pipeline.check()?;
+        self.image.check()?;
+        self.store.check()?;
+        self.rerank.check()?;
         if self.pipeline.store_reads.saturating_add(READERS_KEPT_FREE) > self.store.readers {
             let reason = format!("it must be at least {READERS_KEPT_FREE} less than store.readers");
             return Err(InvalidValue::new("pipeline.store_reads", reason).into());
         }
-        self.extract.encoder_spec()?;
+        // Each of its errors names the key without its section.
+        self.extract.encoder_spec().map_err(ConfigError::Extract)?;
+        if self.extract.head == HeadChoice::None {
+            return Err(ConfigError::NoHead);
+        }
         self.log.check()?;
         Ok(())
     }
@@ -217,8 +259,15 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("placeformer.toml");
         std::fs::write(&path, "[http]\nlisten = \"[::1]:1\"\nmax_page = 7\n").unwrap();
-        let overrides = Overrides { listen: Some("127.0.0.1:0".into()), ..Default::default() };
+        let model = ModelOverrides {
+            weights: Some("own.safetensors".into()),
+            head: Some(HeadChoice::File("head.safetensors".into())),
+            ..Default::default()
+        };
+        let overrides = Overrides { listen: Some("127.0.0.1:0".into()), model, ..Default::default() };
         let config = Config::load(Some(&path), &overrides).unwrap();
+        assert_eq!(config.extract.weights, Some("own.safetensors".into()));
+        assert_eq!(config.extract.head, HeadChoice::File("head.safetensors".into()));
         assert_eq!((config.http.listen.as_str(), config.http.max_page), ("127.0.0.1:0", 7));
         assert_eq!(config.pipeline, PipelineConfig::default());
     }
@@ -233,6 +282,26 @@ mod tests {
             ("[pipeline]\nstore_reads = 7", "store_reads"),
             ("[store]\nreaders = 5", "store_reads"),
             ("[log]\nfilter = \"placeformer=loud\"", "loud"),
+            ("[rerank]\nscales = []", "rerank.scales"),
+            ("[rerank]\nscales = [\"1+2\", \"1\", \"1+2\"]", "1+2 is given twice"),
+            ("[rerank]\ntolerance_patches = 0.0", "rerank.tolerance_patches"),
+            ("[rerank]\ntolerance_patches = nan", "rerank.tolerance_patches"),
+            ("[rerank]\ntolerance_patches = inf", "rerank.tolerance_patches"),
+            ("[rerank]\nmax_iterations = 0", "rerank.max_iterations"),
+            ("[rerank]\nmax_iterations = 1000001", "rerank.max_iterations"),
+            ("[rerank]\nconfidence = 1.0", "rerank.confidence"),
+            ("[rerank]\nconfidence = 0.0", "rerank.confidence"),
+            ("[store]\npage_bytes = 5000", "store.page_bytes"),
+            ("[store]\npage_bytes = 2048", "store.page_bytes"),
+            ("[store]\npage_bytes = 131072", "store.page_bytes"),
+            ("[store]\nreaders = 0", "store.readers"),
+            ("[store]\nqueue = 0", "store.queue"),
+            ("[store]\ncache_kib = 0", "store.cache_kib"),
+            ("[image]\nmax_bytes = 0", "image.max_bytes"),
+            ("[image]\nmax_side = 0", "image.max_side"),
+            ("[image]\nmax_pixels = 0", "image.max_pixels"),
+            ("[extract]\nexit_block = 12", "extract.exit_block"),
+            ("[extract]\nhead = \"none\"", "extract.head"),
             ("[[auth.keys]]\nname = \"a\"\nsha256 = \"12\"\nrole = \"read\"", "sha256"),
         ] {
             let error = from_toml(text).unwrap_err().to_string();

@@ -6,8 +6,8 @@
 
 use super::scenes::index_entry;
 use crate::store::{
-    GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined, ReferencePatch, StoreError,
-    VerifyReport,
+    Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined, ReferencePatch,
+    StoreError, VerifyReport,
 };
 use crate::types::{Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId};
 use rayon::prelude::*;
@@ -117,6 +117,10 @@ impl<S: PlaceStore> PlaceStore for FilledStore<S> {
 
     fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError> {
         self.store.quarantined()
+    }
+
+    fn drain_damage(&self) -> Damage {
+        self.store.drain_damage()
     }
 
     fn backup(&self, target: &Path) -> Result<u64, StoreError> {

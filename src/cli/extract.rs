@@ -26,7 +26,7 @@ pub struct ExtractArgs {
 
 /// Runs it.
 pub fn run(args: ExtractArgs) -> anyhow::Result<()> {
-    let extractor = args.model.open(&args.model.extract_config()?)?;
+    let extractor = Extractor::open(&args.model.extract_config()?)?;
     let bytes = std::fs::read(&args.image).with_context(|| args.image.display().to_string())?;
     let image = load_tensor(&bytes, &ImageConfig::default(), extractor.input_size())
         .with_context(|| args.image.display().to_string())?;

@@ -94,7 +94,7 @@ fn fit(args: FitArgs) -> anyhow::Result<()> {
     // A power that cannot be used is refused before the model is loaded.
     let gem = Aggregate::gem(args.gem_p).map_err(anyhow::Error::msg);
     let gem = if args.aggregate == AggregateKind::Gem { Some(gem?) } else { None };
-    let mut reader = Reader { extractor: args.model.open(&config)?, unreadable: BTreeSet::new() };
+    let mut reader = Reader { extractor: Extractor::open(&config)?, unreadable: BTreeSet::new() };
     let (aggregate, files) = match (args.aggregate, gem) {
         (AggregateKind::Vlad, _) => {
             (Aggregate::Vlad(reader.visual_words(&files, &args)?), spread(&files, MOST_LONG_VECTORS))

@@ -1,8 +1,9 @@
 //! Inspect and delete maps of a running server; give maps another head, there or in a data directory.
 
 use super::client::{ServerArgs, ServerClient};
+use crate::config::{Config, Overrides};
 use crate::extract::Head;
-use crate::store::{HeadExchange, NewHead, StoreConfig};
+use crate::store::{HeadExchange, NewHead};
 use crate::types::MapName;
 use anyhow::{Context, bail, ensure};
 use clap::Subcommand;
@@ -77,6 +78,9 @@ struct ReheadArgs {
     /// Data directory of a stopped server.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
+    /// Settings of that directory's store, as the server reads them (TOML).
+    #[arg(long, env = "PLACEFORMER_CONFIG", value_name = "FILE")]
+    config: Option<PathBuf>,
     /// API key, where the server wants one.
     #[arg(long, env = "PLACEFORMER_API_KEY", hide_env_values = true, value_name = "KEY")]
     api_key: Option<String>,
@@ -130,7 +134,7 @@ fn confirmed(map: &MapName, references: &Value) -> io::Result<bool> {
 }
 
 fn rehead(args: ReheadArgs) -> anyhow::Result<()> {
-    let ReheadArgs { maps, head, server, data, api_key, timeout, .. } = args;
+    let ReheadArgs { maps, head, server, data, config, api_key, timeout, .. } = args;
     // Read here first, so that a file that is no head is told by its name and before any map is touched.
     let head = head.map(|path| read_head(&path)).transpose()?;
     match (server, data, head) {
@@ -138,7 +142,7 @@ fn rehead(args: ReheadArgs) -> anyhow::Result<()> {
             let client = ServerClient::new(ServerArgs { server, api_key, timeout })?;
             rehead_live(&client, &maps, head.map(|(_, file)| file).as_deref())
         }
-        (None, Some(data), Some((head, file))) => rehead_stopped(&maps, &head, &file, &data),
+        (None, Some(data), Some((head, file))) => rehead_stopped(&maps, &head, &file, (&data, config.as_deref())),
         // The groups of the arguments leave nothing else.
         _ => bail!("give --head with --data, or --head or --server-head with --server"),
     }
@@ -163,9 +167,15 @@ fn rehead_live(client: &ServerClient, maps: &[MapName], file: Option<&[u8]>) -> 
     Ok(())
 }
 
-fn rehead_stopped(maps: &[MapName], head: &Head, file: &[u8], data: &Path) -> anyhow::Result<()> {
+fn rehead_stopped(
+    maps: &[MapName],
+    head: &Head,
+    file: &[u8],
+    (data, config): (&Path, Option<&Path>),
+) -> anyhow::Result<()> {
+    let config = Config::load(config, &Overrides::default())?;
     ensure!(data.is_dir(), "there is no store in {}", data.display());
-    let store = super::serve::open_store(data, &StoreConfig::default())?;
+    let store = super::serve::open_store(data, &config.store)?;
     // All are looked at before any is changed.
     let mut plan = Vec::new();
     for map in maps {

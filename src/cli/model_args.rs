@@ -1,8 +1,7 @@
 //! Flags that choose the model and its settings, for the subcommands that run it themselves.
 
-use crate::extract::{ExtractConfig, Extractor, HeadChoice, Precision, Preset};
+use crate::extract::{ExtractConfig, HeadChoice, Precision, Preset};
 use crate::types::{ImageSize, PoolingStride, SCALES};
-use anyhow::Context;
 use std::path::PathBuf;
 
 /// The model and what it computes. What is left out is the preset's own.
@@ -64,6 +63,7 @@ impl ModelOptions {
     pub fn extract_config(&self) -> anyhow::Result<ExtractConfig> {
         let mut config = ExtractConfig {
             preset: self.preset,
+            weights: self.weights.clone(),
             head: self.head.clone(),
             input_size: self.input_size,
             exit_block: self.exit_block,
@@ -81,18 +81,5 @@ impl ModelOptions {
         config.precision = self.precision.unwrap_or(config.precision);
         config.encoder_spec()?;
         Ok(config)
-    }
-
-    /// The weights for `config`: the file given, if it is for this preset, else the preset's own.
-    pub fn weights_for(&self, config: &ExtractConfig) -> anyhow::Result<PathBuf> {
-        match &self.weights {
-            Some(path) if config.preset == self.preset => Ok(path.clone()),
-            _ => crate::extract::pull::resolve_model(config.preset, false).context("cannot obtain the model"),
-        }
-    }
-
-    /// Loads the model for `config`.
-    pub fn open(&self, config: &ExtractConfig) -> anyhow::Result<Extractor> {
-        Ok(Extractor::load(config, &self.weights_for(config)?, None)?)
     }
 }

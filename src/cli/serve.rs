@@ -73,8 +73,7 @@ fn loaders(config: &Config) -> Loaders {
     let (extract, data, store) = (config.extract.clone(), config.data.directory.clone(), config.store.clone());
     Loaders {
         source: Box::new(move || {
-            let weights = crate::extract::pull::resolve_model(extract.preset, false)?;
-            let extractor = Extractor::load(&extract, &weights, None)?;
+            let extractor = Extractor::open(&extract)?;
             extractor.warm_up()?;
             Ok(Arc::new(extractor))
         }),

@@ -1,6 +1,6 @@
 //! Check every record of a store.
 
-use crate::store::StoreConfig;
+use crate::config::{Config, Overrides};
 use anyhow::{Context, ensure};
 use std::path::PathBuf;
 
@@ -10,6 +10,9 @@ pub struct VerifyArgs {
     /// Directory of the store; no server may be using it.
     #[arg(long, value_name = "DIR")]
     data: PathBuf,
+    /// Settings of the store, as the server reads them (TOML).
+    #[arg(long, env = "PLACEFORMER_CONFIG", value_name = "FILE")]
+    config: Option<PathBuf>,
     /// Print the report as JSON.
     #[arg(long)]
     json: bool,
@@ -18,7 +21,8 @@ pub struct VerifyArgs {
 /// Reads everything, quarantines what is damaged, and fails if anything was.
 pub fn run(args: VerifyArgs) -> anyhow::Result<()> {
     ensure!(args.data.is_dir(), "there is no store in {}", args.data.display());
-    let store = super::serve::open_store(&args.data, &StoreConfig::default())?;
+    let config = Config::load(args.config.as_deref(), &Overrides::default())?;
+    let store = super::serve::open_store(&args.data, &config.store)?;
     let report = store.verify().context("the store cannot be read")?;
     if args.json {
         let damaged: Vec<_> =

@@ -98,6 +98,11 @@ pub(super) const SECTIONS: &[(&str, Keys)] = &[
         "extract",
         &[
             ("preset", "The backbone: dinov2-vits14, dinov2-vitb14, dinov2-vitl14 or placeformer-vits16."),
+            (
+                "weights",
+                "Weights file of your own for that backbone (safetensors by timm, DINO or Hugging Face names, or what\n\
+                 `train` wrote); the published ones, pulled on first use, unless set.",
+            ),
             ("input_size", "Images are squashed to this, each side a multiple of the patch size; the preset's own."),
             ("exit_block", "0-based block whose tokens are used; later ones are not computed; the preset's own."),
             ("token_norm", "Whether the tokens pass the final LayerNorm; the preset's own."),
@@ -106,7 +111,11 @@ pub(super) const SECTIONS: &[(&str, Keys)] = &[
             ("tau", "Key patches must exceed this multiple of the uniform attention; 1 is the paper's 0.01."),
             ("caps", "Most key patches at scales 1, 2 and 3."),
             ("stride", "Distance between fused windows: \"kernel\" (no overlap) or \"one\" (every patch)."),
-            ("head", "Projection to the global descriptor: \"default\" or a file."),
+            (
+                "head",
+                "Projection to the global descriptor: \"default\" (the one built in for the backbone and its published\n\
+                 weights) or a file, as `head fit`, `head train` or `train` wrote it. \"none\" is for evaluation only.",
+            ),
             (
                 "precision",
                 "Arithmetic of the transformer: auto (bf16 where the CPU has it, else f32), f32, bf16 or int8.",

@@ -242,6 +242,7 @@ fn variants(base: &Base<'_>) -> Result<Vec<Variant>, EvalError> {
     for &preset in base.backbones {
         let own = ExtractConfig {
             preset,
+            weights: extract.weights.clone().filter(|_| preset == extract.preset),
             head: HeadChoice::None,
             tau: extract.tau,
             caps: extract.caps,

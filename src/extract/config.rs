@@ -15,6 +15,9 @@ use std::str::FromStr;
 pub struct ExtractConfig {
     /// The backbone.
     pub preset: Preset,
+    /// Weights file of one's own for the preset's geometry; the preset's published ones, pulled on first use, unless set.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub weights: Option<PathBuf>,
     /// Size images are squashed to, each side a multiple of the patch size.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub input_size: Option<ImageSize>,
@@ -46,6 +49,7 @@ impl Default for ExtractConfig {
     fn default() -> Self {
         Self {
             preset: Preset::default(),
+            weights: None,
             input_size: None,
             exit_block: None,
             token_norm: None,

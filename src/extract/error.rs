@@ -1,5 +1,6 @@
 //! Everything that can go wrong between a normalised image and its descriptor.
 
+use super::pull::PullError;
 use crate::error::ErrorCode;
 use crate::kernels::SimdError;
 use crate::types::{ImageSize, InvalidValue};
@@ -47,6 +48,9 @@ pub enum ExtractError {
         /// The hash of what is there, hexadecimal.
         actual: String,
     },
+    /// The weights cannot be obtained.
+    #[error("cannot obtain the weights")]
+    Pull(#[source] Box<PullError>),
     /// The head was made for other tokens.
     #[error("the head{} was fitted for {head_backbone}, the model is {backbone}", at(path))]
     HeadMismatch {
@@ -60,7 +64,7 @@ pub enum ExtractError {
     /// No head is known for these tokens.
     #[error(
         "no head is built in for {backbone}: make one with `placeformer head fit --images DIR --out FILE` and name it \
-         with --head FILE"
+         with --head FILE, or as extract.head in the configuration"
     )]
     NoHead {
         /// The backbone that lacks one.
@@ -147,6 +151,7 @@ impl ExtractError {
             | Self::BadFile { .. }
             | Self::WrongTensors { .. }
             | Self::HashMismatch { .. }
+            | Self::Pull(_)
             | Self::WrongSize { .. }
             | Self::WrongLength { .. }
             | Self::NotFinite
@@ -160,6 +165,15 @@ impl ExtractError {
     pub(crate) fn io(path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
         move |source| Self::Io { path, source }
+    }
+}
+
+impl From<PullError> for ExtractError {
+    fn from(error: PullError) -> Self {
+        match error {
+            PullError::Weights(error) => error,
+            other => Self::Pull(Box::new(other)),
+        }
     }
 }
 

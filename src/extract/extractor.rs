@@ -9,9 +9,9 @@ use super::head::Head;
 use super::preset::Geometry;
 use super::trace::ExtractionTrace;
 use super::weights::VitWeights;
-use super::{fusion, model_id, positions, record, selection};
+use super::{fusion, model_id, positions, pull, record, selection};
 use crate::kernels;
-use crate::types::{Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid};
+use crate::types::{Descriptor, ImageSize, ImageTensor, InvalidValue, KeyPatches, ModelId, PackedPatches, PatchGrid};
 use std::path::Path;
 
 /// A loaded model with its head.
@@ -29,15 +29,21 @@ pub struct Extractor {
 }
 
 impl Extractor {
-    /// Loads weights and head; refuses files that do not fit by name, shape or hash. `head` overrides the settings'.
+    /// Opens the model that the settings name: the weights file they give, else the preset's own, fetched on first use.
     ///
-    /// Reads and hashes some hundred megabytes: call it off the async threads.
-    pub fn load(config: &ExtractConfig, weights: &Path, head: Option<&Path>) -> Result<Self, ExtractError> {
+    /// May fetch, and reads and hashes some hundred megabytes: call it off the async threads.
+    pub fn open(config: &ExtractConfig) -> Result<Self, ExtractError> {
+        // A wrong setting costs no download.
+        config.encoder_spec()?;
+        Self::load(config, &pull::resolve_weights(config)?)
+    }
+
+    /// Loads weights and head; refuses files that do not fit by name, shape or hash.
+    pub fn load(config: &ExtractConfig, weights: &Path) -> Result<Self, ExtractError> {
         config.encoder_spec()?;
         record::verify(weights)?;
         let weights = VitWeights::load(weights, config.preset, config.heads)?;
-        let choice = head.map_or_else(|| config.head.clone(), |path| HeadChoice::File(path.to_owned()));
-        Self::from_weights(config, &weights, &choice)
+        Self::from_weights(config, &weights, &config.head)
     }
 
     /// As [`Extractor::load`], from weights in memory.
@@ -59,6 +65,17 @@ impl Extractor {
             backbone,
             model_id,
         })
+    }
+
+    /// The same model computed by another encoder, such as the plain one that the fused one is tested against.
+    ///
+    /// # Errors
+    /// One that computes something else than the settings say.
+    pub fn with_encoder(self, encoder: Box<dyn Encoder>) -> Result<Self, ExtractError> {
+        if encoder.spec() != self.encoder.spec() {
+            return Err(InvalidValue::new("encoder", format!("it computes {:?}", encoder.spec())).into());
+        }
+        Ok(Self { encoder, ..self })
     }
 
     /// What its descriptors may be compared with.
@@ -94,11 +111,6 @@ impl Extractor {
     /// The size images must be resized to.
     pub fn input_size(&self) -> ImageSize {
         self.encoder.spec().input_size
-    }
-
-    /// Length of the global descriptor: 256, or the backbone's width where there is no head.
-    pub fn global_dim(&self) -> usize {
-        if self.head.is_some() { GLOBAL_DIM } else { self.geometry.dim }
     }
 
     /// Length of a token and of a key patch's descriptor.

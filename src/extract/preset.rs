@@ -128,6 +128,15 @@ impl Preset {
         }
     }
 
+    /// The content hash ([`VitWeights::content_hash`](super::VitWeights::content_hash)) of its published weights, where
+    /// something that ships depends on them bit for bit: the built-in head and calibration of the default do.
+    pub fn content_sha256(self) -> Option<&'static str> {
+        match self {
+            Self::Dinov2Vits14 => Some("747267a07f39bc8916583ac2ee193ab2eaa34801a834e73fc97a5587c9e657f7"),
+            Self::Dinov2Vitb14 | Self::Dinov2Vitl14 | Self::PlaceformerVits16 => None,
+        }
+    }
+
     /// Rows and columns the learned position table may have: DINOv2's 37x37; for the paper's geometry any square (as
     /// pre-trained) or the grid of the input it was trained at.
     pub fn position_grid(self, entries: usize) -> Option<(usize, usize)> {

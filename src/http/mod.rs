@@ -11,6 +11,7 @@
 pub mod auth;
 pub mod body;
 pub mod config;
+mod examples;
 pub mod limits;
 pub mod observe;
 pub mod openapi;

@@ -1,7 +1,7 @@
 //! The OpenAPI document: operations and answers from the handlers, errors from the one table.
 
 use super::problem::{PROBLEM_JSON, ProblemBody};
-use super::routes;
+use super::{examples, routes};
 use crate::error::ErrorCode;
 use crate::ops::Metrics;
 use serde_json::{Map, Value, json};
@@ -51,6 +51,7 @@ pub fn document() -> Value {
         "content": {"application/octet-stream": binary()},
     });
     for (path, method, operation) in operations(&mut document) {
+        add_examples(operation);
         add_errors(operation, &errors_of(&path, &method));
         if !is_public(&path) {
             operation["security"] = json!([{}, {"bearer": []}, {"header": []}]);
@@ -97,14 +98,17 @@ fn errors_of(path: &str, method: &str) -> Vec<ErrorCode> {
         ("/livez", _) | ("/openapi.json", _) => return vec![Internal],
         ("/readyz", _) => return vec![InvalidParameter],
         ("/metrics", _) => return vec![Unauthorized, Forbidden, RateLimited, Internal],
-        ("/references", "post") => &[&sent, &image, &[ExternalIdConflict, ModelMismatch, MemoryPressure, DiskFull]],
-        ("/query", _) => &[&sent, &image, &[MapNotFound, ModelMismatch, DeadlineExceeded]],
+        ("/references", "post") => {
+            &[&sent, &image, &[ExternalIdConflict, ModelMismatch, CorruptRecord, MemoryPressure, DiskFull]]
+        }
+        ("/query", _) => &[&sent, &image, &[MapNotFound, ModelMismatch, CorruptRecord, DeadlineExceeded]],
         ("/match", _) => &[&sent, &image, &[ReferenceNotFound, ModelMismatch, CorruptRecord, DeadlineExceeded]],
-        ("/references", _) => &[&[InvalidParameter, MapNotFound]],
+        ("/references", _) => &[&[InvalidParameter, MapNotFound, CorruptRecord]],
         ("/references/{id}", "patch") => &[&sent, &[ReferenceNotFound, ExternalIdConflict, CorruptRecord, DiskFull]],
-        ("/references/{id}", _) => &[&[ReferenceNotFound, CorruptRecord, DiskFull]],
-        ("/maps/{map}/calibration", "put") => &[&sent, &[MapNotFound, CalibrationMismatch, DiskFull]],
-        ("/maps/{map}/calibration", _) => &[&[MapNotFound, DiskFull]],
+        ("/references/{id}", "delete") => &[&[ReferenceNotFound, CorruptRecord, DiskFull]],
+        ("/references/{id}", _) => &[&[ReferenceNotFound, CorruptRecord]],
+        ("/maps/{map}/calibration", "put") => &[&sent, &[MapNotFound, CalibrationMismatch, CorruptRecord, DiskFull]],
+        ("/maps/{map}/calibration", _) | ("/maps/{map}", "delete") => &[&[MapNotFound, CorruptRecord, DiskFull]],
         ("/maps/{map}/head", "put") => &[
             &sent,
             &[MapNotFound, HeadUnreadable, HeadMismatch, ModelMismatch, CorruptRecord, MemoryPressure, DiskFull],
@@ -112,7 +116,7 @@ fn errors_of(path: &str, method: &str) -> Vec<ErrorCode> {
         ("/maps/{map}/head", _) => {
             &[&[MapNotFound, HeadMismatch, ModelMismatch, CorruptRecord, Overloaded, MemoryPressure, DiskFull]]
         }
-        ("/maps/{map}", _) => &[&[MapNotFound, DiskFull]],
+        ("/maps/{map}", _) => &[&[MapNotFound, CorruptRecord]],
         _ => &[],
     };
     let mut codes: Vec<ErrorCode> = own.iter().flat_map(|codes| codes.iter()).chain(&guarded).copied().collect();
@@ -154,6 +158,22 @@ fn example(code: ErrorCode) -> Value {
     })
 }
 
+/// A realistic answer, and a JSON body to send.
+fn add_examples(operation: &mut Value) {
+    let id = operation["operationId"].as_str().unwrap_or_default().to_owned();
+    for (status, response) in operation["responses"].as_object_mut().into_iter().flatten() {
+        let example = if status == "503" { Some(examples::not_ready()) } else { examples::answer(&id) };
+        for (_, content) in response["content"].as_object_mut().into_iter().flatten() {
+            content["example"] = example.clone().unwrap_or_default();
+        }
+    }
+    if let (Some(content), Some(body)) =
+        (operation.pointer_mut("/requestBody/content/application~1json"), examples::body(&id))
+    {
+        content["example"] = body;
+    }
+}
+
 /// The three ways to send images.
 fn describe_uploads(document: &mut Value) {
     let uploads = [
@@ -180,7 +200,7 @@ fn describe_uploads(document: &mut Value) {
             "content": {
                 "image/jpeg": raw, "image/png": raw, "image/webp": raw, "application/octet-stream": raw,
                 "multipart/form-data": {"schema": form, "encoding": {"json": {"contentType": "application/json"}}},
-                "application/json": {"schema": plain, "example": json_example(path)},
+                "application/json": {"schema": plain},
             },
         });
     }
@@ -189,16 +209,4 @@ fn describe_uploads(document: &mut Value) {
 /// A body that is bytes.
 fn binary() -> Value {
     json!({"schema": {"type": "string", "format": "binary", "minLength": 1}})
-}
-
-fn json_example(path: &str) -> Value {
-    // A black PNG of one pixel.
-    let pixel = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg==";
-    match path {
-        "/references" => json!({"image": pixel, "map": "harbour", "external_id": "drive7/000123.jpg",
-            "lat": 51.5072, "lon": -0.1276, "heading": 270, "captured_at": "2026-05-17T09:30:00Z",
-            "metadata": {"camera": "left"}}),
-        "/query" => json!({"image": pixel, "map": "harbour", "top_k": 5, "deadline_ms": 2000}),
-        _ => json!({"query": pixel, "reference": pixel}),
-    }
 }

@@ -20,7 +20,7 @@ pub use error::ImageError;
 pub use exif::{ExifInfo, read_exif};
 pub use resize::{DEVIATION, MEAN};
 
-use crate::types::{ImageSize, ImageTensor};
+use crate::types::{ImageSize, ImageTensor, InvalidValue};
 use serde::{Deserialize, Serialize};
 
 /// Limits checked before decoding.
@@ -38,6 +38,21 @@ pub struct ImageConfig {
 impl Default for ImageConfig {
     fn default() -> Self {
         Self { max_bytes: 20 << 20, max_side: 16_384, max_pixels: 64_000_000 }
+    }
+}
+
+impl ImageConfig {
+    /// Refuses limits that no image meets.
+    pub fn check(&self) -> Result<(), InvalidValue> {
+        let limits = [
+            ("image.max_bytes", self.max_bytes as u64),
+            ("image.max_side", u64::from(self.max_side)),
+            ("image.max_pixels", self.max_pixels),
+        ];
+        match limits.iter().find(|(_, value)| *value == 0) {
+            Some((field, _)) => Err(InvalidValue::new(field, "0 would refuse every image")),
+            None => Ok(()),
+        }
     }
 }
 

@@ -172,7 +172,7 @@ fn head_queries<'a>(shape: &AttentionShape, head: usize, first: usize, queries: 
 ///
 /// # Panics
 /// If a slice is shorter than `shape` says.
-#[allow(clippy::too_many_arguments)]
+#[allow(clippy::too_many_arguments, reason = "a kernel's operands; each is used once")]
 pub fn attend(
     simd: Simd,
     shape: &AttentionShape,

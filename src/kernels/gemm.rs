@@ -288,7 +288,7 @@ impl TileJob {
 
     // Pointers advance by `wrapping_add` because builds with assertions check `add` at every step, which this loop cannot
     // afford; `multiply_panel` has checked once that every access lies inside its slice.
-    #[allow(clippy::needless_range_loop)] // Indices keep the sums in registers; iterators leave them in memory.
+    #[allow(clippy::needless_range_loop, reason = "indices keep the sums in registers; iterators leave them in memory")]
     #[inline(always)]
     unsafe fn tile<D: Dot, const MR: usize, const NV: usize>(&self, left: *const u32, out: *mut u32) {
         let vectors: [usize; NV] = std::array::from_fn(|vector| vector * D::COUNT);

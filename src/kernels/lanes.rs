@@ -102,7 +102,7 @@ struct Unaligned<T>(T);
 ///
 /// # Safety
 /// `place` must be valid for reads of `T`; it need not be aligned.
-#[allow(clippy::transmute_ptr_to_ref)]
+#[allow(clippy::transmute_ptr_to_ref, reason = "a dereferenced pointer is checked for null where assertions are on")]
 #[inline(always)]
 unsafe fn read<T: Copy>(place: *const f32) -> T {
     // SAFETY: the caller's; the packed type needs no alignment.
@@ -114,7 +114,7 @@ unsafe fn read<T: Copy>(place: *const f32) -> T {
 ///
 /// # Safety
 /// `place` must be valid for writes of `T`; it need not be aligned.
-#[allow(clippy::transmute_ptr_to_ref)]
+#[allow(clippy::transmute_ptr_to_ref, reason = "a dereferenced pointer is checked for null where assertions are on")]
 #[inline(always)]
 unsafe fn write<T: Copy>(place: *mut f32, value: T) {
     // SAFETY: the caller's; the packed type needs no alignment.

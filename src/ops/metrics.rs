@@ -181,7 +181,10 @@ impl Metrics {
                     .buckets(SCORES.to_vec()),
             )?,
             unmatched: IntCounter::new(full("query_unmatched_total"), "Queries whose best answer is not trusted.")?,
-            corrupt_records: IntCounter::new(full("corrupt_records_total"), "Damaged records that queries met.")?,
+            corrupt_records: IntCounter::new(
+                full("corrupt_records_total"),
+                "Damaged records met, at start or by any request.",
+            )?,
             quarantined: IntGauge::new(full("quarantined_references"), "Damaged references set aside, not served.")?,
             ready: IntGauge::new(full("ready"), "1 if queries are answered (/readyz?for=query), else 0.")?,
             disk_free_bytes: IntGauge::new(full("disk_free_bytes"), "Free bytes on the store's disk.")?,
@@ -284,9 +287,9 @@ impl Metrics {
         }
     }
 
-    /// A stored record failed its checksum.
-    pub fn corrupt_record(&self) {
-        self.corrupt_records.inc();
+    /// So many damaged records were met for the first time.
+    pub fn corrupt_records(&self, records: u64) {
+        self.corrupt_records.inc_by(records);
     }
 
     /// Damaged references that are set aside until they are sent again or deleted.

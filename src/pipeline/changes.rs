@@ -3,7 +3,7 @@
 use super::blocking::blocking;
 use super::maps::Change;
 use super::{PipelineError, Service};
-use crate::store::ReferencePatch;
+use crate::store::{ReferencePatch, StoreError};
 use crate::types::{Calibration, MapName, Reference, ReferenceFields, ReferenceId};
 use std::sync::Arc;
 
@@ -61,8 +61,12 @@ impl Service {
     }
 
     fn delete_map_now(&self, name: &MapName) -> Result<u64, PipelineError> {
-        let entry = self.maps.live(name).map(|_| self.maps.entry(name));
-        let entry = entry.ok_or_else(|| PipelineError::MapNotFound(name.clone()))?;
+        // One that cannot be served because its own record is damaged can still be deleted.
+        let damaged = || matches!(self.store.map(name), Err(StoreError::CorruptMap { .. }));
+        if self.maps.live(name).is_none() && !damaged() {
+            return Err(PipelineError::MapNotFound(name.clone()));
+        }
+        let entry = self.maps.entry(name);
         let _changing = entry.changing();
         let deleted = self.store.delete_map(name)?;
         entry.clear();
@@ -93,6 +97,7 @@ impl Service {
         let service = self.clone();
         let outcome = blocking(move || {
             let outcome = work(&service);
+            service.follow_damage();
             drop(place);
             outcome
         });

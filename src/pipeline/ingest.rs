@@ -132,7 +132,10 @@ impl Service {
                 self.health.set_disk_full(true);
                 self.metrics.rejected(Rejection::DiskFull);
             }
-        })?;
+        });
+        // A damaged reference that this one replaces leaves the index before anyone may miss it in the store.
+        self.follow_damage();
+        let inserted = inserted?;
         if let Inserted::Created(reference) = &inserted {
             self.metrics.stored_descriptor(global.len() * size_of::<f32>(), patch_bytes);
             entry.live_or_create(&model).index.insert(IndexEntry {

@@ -9,6 +9,7 @@ use crate::ops::Stage;
 use crate::ops::metrics::Rejection;
 use crate::rerank::{PairScore, Reranked};
 use crate::search::Neighbour;
+use crate::store::StoreError;
 use crate::types::{Deadline, Descriptor, MapName, ModelId, Reference, ReferenceFilter, ReferenceId};
 use bytes::Bytes;
 use std::collections::HashMap;
@@ -75,6 +76,7 @@ struct Placed {
 }
 
 struct Plan {
+    name: MapName,
     map: Arc<LiveMap>,
     top_k: usize,
     candidates: usize,
@@ -101,7 +103,10 @@ impl Service {
     }
 
     async fn answer(self: &Arc<Self>, request: QueryRequest) -> Result<QueryAnswer, PipelineError> {
-        let plan = self.plan(&request.map, request.options)?;
+        let plan = match self.plan(&request.map, request.options) {
+            Err(PipelineError::MapNotFound(map)) => return Err(self.why_no_map(map).await),
+            plan => plan?,
+        };
         let patience = plan.deadline.remaining().min(self.patience());
         let purpose = Purpose::Answer(plan.deadline);
         purpose.not_passed("decoding")?;
@@ -112,6 +117,7 @@ impl Service {
         let service = self.clone();
         let ranked = blocking(move || {
             let ranked = service.rank(&plan, &descriptor, timings);
+            service.follow_damage();
             drop(ticket);
             ranked
         })
@@ -123,6 +129,7 @@ impl Service {
         let top_k = self.config.check_count("top_k", options.top_k.unwrap_or(self.config.top_k))?;
         let candidates = options.candidates.unwrap_or(self.config.candidates);
         Ok(Plan {
+            name: map.clone(),
             map: self.maps.comparable(map, self.extraction.source().model_id())?,
             top_k,
             candidates: self.config.check_count("candidates", candidates)?,
@@ -143,7 +150,7 @@ impl Service {
         let was_reranked = reranked.is_some();
         let placed =
             reranked.unwrap_or_else(|| neighbours.iter().map(|&neighbour| Placed { neighbour, score: None }).collect());
-        let results = self.with_metadata(placed, plan.top_k)?;
+        let results = self.with_metadata(plan, placed)?;
         let best = results.first();
         let verdict = self.trust.judge(&plan.map.model, plan.map.calibration().as_deref(), best);
         let top1 = best.and_then(|best| best.score.as_ref()).map_or(0, |score| score.spatial_score);
@@ -178,9 +185,8 @@ impl Service {
         let Reranked::Complete { ranked, failed } = outcome else { return Ok(None) };
         for (i, error) in failed {
             match error.code() {
-                // Deleted since the search.
-                ErrorCode::ReferenceNotFound => {}
-                ErrorCode::CorruptRecord => self.set_aside(plan, candidates[i].id, &error),
+                // Deleted since the search, or damaged: the others are answered.
+                ErrorCode::ReferenceNotFound | ErrorCode::CorruptRecord => self.withdraw(plan, candidates[i].id),
                 _ => return Err(error.into()),
             }
         }
@@ -198,16 +204,22 @@ impl Service {
         timings.record(&self.metrics, Stage::Rerank, wall - loading);
     }
 
-    /// A damaged record leaves the index; the store has quarantined it.
-    fn set_aside(&self, plan: &Plan, id: ReferenceId, error: &dyn std::error::Error) {
-        tracing::error!(reference = %id, %error, "a stored record is damaged; it is no longer served");
-        self.metrics.corrupt_record();
-        plan.map.index.remove(id);
+    /// What the store does not serve is not searched again. Nothing but a deletion takes a reference out of the store,
+    /// so one that is in the index and unknown to the store while no deletion is under way was lost.
+    fn withdraw(&self, plan: &Plan, id: ReferenceId) {
+        let entry = self.maps.entry(&plan.name);
+        let _settled = entry.changing();
+        let searched = plan.map.index.remove(id) && entry.live().is_some_and(|live| Arc::ptr_eq(&live, &plan.map));
         self.patches.forget(id);
+        if searched && matches!(self.store.get(id), Err(StoreError::ReferenceNotFound { .. })) {
+            tracing::error!(reference = %id, "the store has lost a reference; check its database");
+            self.metrics.corrupt_records(1);
+        }
     }
 
     /// The first `top_k` that still exist.
-    fn with_metadata(&self, placed: Vec<Placed>, top_k: usize) -> Result<Vec<QueryResult>, PipelineError> {
+    fn with_metadata(&self, plan: &Plan, placed: Vec<Placed>) -> Result<Vec<QueryResult>, PipelineError> {
+        let top_k = plan.top_k;
         let mut results = Vec::with_capacity(top_k.min(placed.len()));
         let mut placed = placed.into_iter().peekable();
         while results.len() < top_k && placed.peek().is_some() {
@@ -216,7 +228,10 @@ impl Service {
             let mut found: HashMap<ReferenceId, Reference> =
                 self.store.get_many(&ids)?.into_iter().map(|reference| (reference.id, reference)).collect();
             results.extend(batch.into_iter().filter_map(|one| {
-                let reference = found.remove(&one.neighbour.id)?;
+                let Some(reference) = found.remove(&one.neighbour.id) else {
+                    self.withdraw(plan, one.neighbour.id);
+                    return None;
+                };
                 Some(QueryResult { reference, global_distance: one.neighbour.distance, score: one.score })
             }));
         }

@@ -7,6 +7,7 @@ use super::maps::Maps;
 use super::patches::PatchCache;
 use super::trust::Trust;
 use super::{PipelineConfig, PipelineError};
+use crate::error::ErrorCode;
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::metrics::MemoryComponent;
 use crate::ops::{Health, Metrics};
@@ -148,6 +149,29 @@ impl Service {
         }
     }
 
+    /// Counts damage that the store has met, and stops searching for what it no longer serves.
+    pub(super) fn follow_damage(&self) {
+        let damage = self.store.drain_damage();
+        self.metrics.corrupt_records(damage.found);
+        if damage.withdrawn.is_empty() {
+            return;
+        }
+        for (_, live) in self.maps.all() {
+            for &id in &damage.withdrawn {
+                live.index.remove(id);
+            }
+        }
+        damage.withdrawn.iter().for_each(|&id| self.patches.forget(id));
+    }
+
+    /// A map that cannot be searched does not exist, or its record is damaged.
+    pub(super) async fn why_no_map(self: &Arc<Self>, name: MapName) -> PipelineError {
+        match self.map(name.clone()).await {
+            Err(error) if error.code() == ErrorCode::CorruptRecord => error,
+            _ => PipelineError::MapNotFound(name),
+        }
+    }
+
     /// Reads the store in turn with others.
     ///
     /// Cancel safety: dropped while waiting, nothing is read; dropped later, the read holds its place until it ends.
@@ -159,6 +183,7 @@ impl Service {
         let service = self.clone();
         let outcome = blocking(move || {
             let outcome = work(&*service.store);
+            service.follow_damage();
             drop(place);
             outcome
         })

@@ -6,6 +6,7 @@ use super::maps::{LiveMap, MapEntry, Maps, Projection};
 use super::patches::PatchCache;
 use super::trust::Trust;
 use super::{DescriptorSource, PipelineConfig, PipelineError, Service};
+use crate::error::ErrorCode;
 use crate::extract::Head;
 use crate::image::ImageConfig;
 use crate::ops::memory::MemoryWatermark;
@@ -19,6 +20,9 @@ use std::sync::Arc;
 
 /// References between two reports of progress.
 const PROGRESS_STEP: u64 = 1024;
+
+/// Most entries that a map's own count, which no checksum covers, is trusted for.
+const MOST_RESERVED: usize = 1 << 20;
 
 /// What a service is made of.
 pub struct Parts {
@@ -65,6 +69,8 @@ impl Service {
             metrics: parts.metrics,
             health: parts.health,
         });
+        // The scan of all global descriptors may have met damage.
+        service.follow_damage();
         Ok(service)
     }
 }
@@ -75,7 +81,7 @@ fn build_indexes(
     health: &Health,
 ) -> Result<Maps, PipelineError> {
     let (maps, infos) = (Maps::default(), store.maps()?);
-    health.building_index(infos.iter().map(|info| info.references).sum());
+    health.building_index(infos.iter().fold(0, |sum, info| sum.saturating_add(info.references)));
     infos.par_iter().try_for_each(|info| build_index(store, source, health, info, &maps.entry(&info.name)))?;
     Ok(maps)
 }
@@ -93,13 +99,19 @@ fn build_index(
         entry.put(LiveMap::new(model, projection, MapIndex::default(), info.calibration.clone()));
         return Ok(());
     }
-    let mut entries = Vec::with_capacity(info.references as usize);
-    store.scan_globals(&info.name, &mut |row| {
+    let mut entries = Vec::with_capacity((info.references as usize).min(MOST_RESERVED));
+    let scanned = store.scan_globals(&info.name, &mut |row| {
         entries.push(index_entry(row));
         if (entries.len() as u64).is_multiple_of(PROGRESS_STEP) {
             health.indexed(PROGRESS_STEP);
         }
-    })?;
+    });
+    match scanned {
+        Err(error) if error.code() == ErrorCode::CorruptRecord => {
+            tracing::error!(map = %info.name, %error, "only a part of this map can be searched");
+        }
+        outcome => outcome?,
+    }
     health.indexed(entries.len() as u64 % PROGRESS_STEP);
     tracing::info!(map = %info.name, references = entries.len(), "indexed");
     entry.put(LiveMap::new(model, projection, MapIndex::build(entries), info.calibration.clone()));

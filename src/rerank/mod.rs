@@ -17,7 +17,7 @@ mod score;
 mod tests;
 
 use crate::kernels::simd::{self, Simd};
-use crate::types::{Deadline, PackedPatches, RerankId, ScaleSet};
+use crate::types::{Deadline, InvalidValue, PackedPatches, RerankId, ScaleSet};
 use mutual_nn::PreparedQuery;
 use rayon::prelude::*;
 use score::{with_prepared, with_workspace};
@@ -37,6 +37,9 @@ pub struct RerankConfig {
     pub confidence: f64,
 }
 
+/// Beyond this one candidate takes seconds.
+const MOST_ITERATIONS: u32 = 1_000_000;
+
 impl Default for RerankConfig {
     fn default() -> Self {
         Self { scales: ScaleSet::paper_default(), tolerance_patches: 1.5, max_iterations: 2000, confidence: 0.995 }
@@ -44,6 +47,30 @@ impl Default for RerankConfig {
 }
 
 impl RerankConfig {
+    /// Refuses settings under which no candidate could be scored, or only wrongly.
+    pub fn check(&self) -> Result<(), InvalidValue> {
+        let refuse = |field, reason: String| Err(InvalidValue::new(field, reason));
+        if self.scales.is_empty() {
+            return refuse("rerank.scales", "no scale combination is given, so every S would be 0".into());
+        }
+        if let Some(twice) = self.scales.iter().enumerate().find(|(i, set)| self.scales[..*i].contains(set)) {
+            return refuse("rerank.scales", format!("{} is given twice", twice.1));
+        }
+        if !(self.tolerance_patches.is_finite() && self.tolerance_patches > 0.0) {
+            return refuse("rerank.tolerance_patches", format!("{} is not a positive number", self.tolerance_patches));
+        }
+        if !(1..=MOST_ITERATIONS).contains(&self.max_iterations) {
+            return refuse(
+                "rerank.max_iterations",
+                format!("{} is outside 1 to {MOST_ITERATIONS}", self.max_iterations),
+            );
+        }
+        if !(self.confidence > 0.0 && self.confidence < 1.0) {
+            return refuse("rerank.confidence", format!("{} is not between 0 and 1", self.confidence));
+        }
+        Ok(())
+    }
+
     /// Everything that S depends on beyond the descriptors: `1,1+2,2+3:t1.5:i2000:c0.995`.
     pub fn id(&self) -> RerankId {
         let scales: Vec<String> = self.scales.iter().map(ToString::to_string).collect();

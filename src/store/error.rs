@@ -62,7 +62,7 @@ pub enum StoreError {
         reason: String,
     },
     /// A map's own record fails its checksum.
-    #[error("the record of map {map} is damaged on disk; restore a backup")]
+    #[error("the record of map {map} is damaged on disk; restore a backup, or delete the map")]
     CorruptMap {
         /// Its name as far as it can be read.
         map: String,
@@ -72,6 +72,14 @@ pub enum StoreError {
     CorruptHead {
         /// The map.
         map: MapName,
+    },
+    /// A part of the database that belongs to no single record is damaged.
+    #[error("the database is damaged, noticed while {context}: {source}; check the stopped store, or restore a backup")]
+    Damaged {
+        /// What was being done.
+        context: &'static str,
+        /// What the engine said.
+        source: EngineCause,
     },
     /// The descriptor offered breaks a rule of its type: a fault of the caller.
     #[error("the descriptor cannot be stored: {reason}")]
@@ -154,7 +162,9 @@ impl StoreError {
             Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
             Self::ModelMismatch { .. } => ErrorCode::ModelMismatch,
             Self::CalibrationMismatch { .. } => ErrorCode::CalibrationMismatch,
-            Self::Corrupt { .. } | Self::CorruptMap { .. } | Self::CorruptHead { .. } => ErrorCode::CorruptRecord,
+            Self::Corrupt { .. } | Self::CorruptMap { .. } | Self::CorruptHead { .. } | Self::Damaged { .. } => {
+                ErrorCode::CorruptRecord
+            }
             Self::DiskFull => ErrorCode::DiskFull,
             Self::Busy { .. } | Self::ReheadInProgress { .. } => ErrorCode::Overloaded,
             Self::Closing => ErrorCode::ShuttingDown,

@@ -14,11 +14,15 @@ pub use error::{EngineCause, StoreError};
 pub use sqlite::SqliteStore;
 
 use crate::types::{
-    Calibration, ExternalId, MapName, ModelId, NewReference, PackedPatches, Reference, ReferenceFields, ReferenceId,
+    Calibration, ExternalId, InvalidValue, MapName, ModelId, NewReference, PackedPatches, Reference, ReferenceFields,
+    ReferenceId,
 };
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use time::OffsetDateTime;
+
+/// Most connections, and most waiting writes: each reader holds files open, each waiting write a descriptor.
+const MOST_AT_ONCE: usize = 65_536;
 
 /// Settings of the embedded store.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,6 +52,25 @@ impl Default for StoreConfig {
             reserve_bytes: 64 << 20,
             queue: 256,
         }
+    }
+}
+
+impl StoreConfig {
+    /// Refuses what the engine would silently replace by its own idea, or what leaves a store nobody can use.
+    pub fn check(&self) -> Result<(), InvalidValue> {
+        let refuse = |field, reason: String| Err(InvalidValue::new(field, reason));
+        if !self.page_bytes.is_power_of_two() || !(4096..=65_536).contains(&self.page_bytes) {
+            return refuse("store.page_bytes", format!("{} is not a power of two from 4096 to 65536", self.page_bytes));
+        }
+        for (field, value) in [("store.readers", self.readers), ("store.queue", self.queue)] {
+            if !(1..=MOST_AT_ONCE).contains(&value) {
+                return refuse(field, format!("{value} is outside 1 to {MOST_AT_ONCE}"));
+            }
+        }
+        if self.cache_kib == 0 || self.cache_kib > i32::MAX as u32 {
+            return refuse("store.cache_kib", format!("{} is outside 1 to {}", self.cache_kib, i32::MAX));
+        }
+        Ok(())
     }
 }
 
@@ -161,6 +184,15 @@ impl<F: FnMut(&[f32]) -> Vec<f32>> HeadExchange for F {
     }
 }
 
+/// Damage that a store has met since it was last asked.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Damage {
+    /// Damaged records met for the first time, whichever call met them.
+    pub found: u64,
+    /// References that are no longer served because of it: quarantined, or replaced by their image sent again.
+    pub withdrawn: Vec<ReferenceId>,
+}
+
 /// A durable set of maps. All calls block; callers keep them off the async threads.
 ///
 /// A write returns only after it is fsynced; a reader sees a reference whole or not at all.
@@ -192,11 +224,12 @@ pub trait PlaceStore: Send + Sync {
     /// Deletes a map with everything in it, at once and atomically; returns how many references that were. Their
     /// room is freed in the background.
     fn delete_map(&self, name: &MapName) -> Result<u64, StoreError>;
-    /// Metadata of several references; those that vanished meanwhile are left out.
+    /// Metadata of several references; those that vanished meanwhile or are damaged are left out.
     fn get_many(&self, ids: &[ReferenceId]) -> Result<Vec<Reference>, StoreError>;
     /// Key patches of one reference, checked against their checksum.
     fn patches(&self, id: ReferenceId) -> Result<PackedPatches, StoreError>;
-    /// Every global descriptor of a map, to rebuild its index.
+    /// Every global descriptor of a map that can be read, to rebuild its index. References whose descriptor is damaged
+    /// or lost are quarantined and left out. An error says that others may be missing, too; those visited are good.
     fn scan_globals(&self, map: &MapName, visit: &mut dyn FnMut(GlobalRow)) -> Result<(), StoreError>;
     /// Gives a map another head: `exchange` makes the new global vectors of the pooled ones. Atomic: all references
     /// change to the new model or none. Reads and writes go on meanwhile; the map's calibration is cleared.
@@ -207,8 +240,10 @@ pub trait PlaceStore: Send + Sync {
     fn set_calibration(&self, map: &MapName, calibration: Option<Calibration>) -> Result<(), StoreError>;
     /// References known to be damaged. They are not served; deleting them or sending their image again ends it.
     fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError>;
+    /// What damage was met since the last call, so that it can be counted and an index follow. Cheap where there is none.
+    fn drain_damage(&self) -> Damage;
     /// Writes a consistent copy of everything to a new file while the store is in use; returns its size in bytes.
-    /// Put in a data directory under the database's name (`placeformer.db`) it is a store again.
+    /// Put in a data directory under the database's name ([`SqliteStore::DATABASE`]) it is a store again.
     fn backup(&self, target: &Path) -> Result<u64, StoreError>;
     /// Reads everything, checks every checksum, quarantines what is damaged.
     fn verify(&self) -> Result<VerifyReport, StoreError>;

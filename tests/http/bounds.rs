@@ -4,8 +4,8 @@ use crate::support::{App, FakeSource, Gate, PATIENCE, multipart, picture, until}
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use placeformer::store::{
-    GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined, ReferencePatch, SqliteStore,
-    StoreError, VerifyReport,
+    Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined, ReferencePatch,
+    SqliteStore, StoreError, VerifyReport,
 };
 use placeformer::types::{Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId};
 use serde_json::json;
@@ -231,6 +231,9 @@ impl PlaceStore for Gated {
     }
     fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError> {
         self.inner.quarantined()
+    }
+    fn drain_damage(&self) -> Damage {
+        self.inner.drain_damage()
     }
     fn backup(&self, target: &Path) -> Result<u64, StoreError> {
         self.inner.backup(target)

@@ -6,9 +6,11 @@ mod small_disk;
 mod support;
 
 mod admission;
+mod backup;
 mod bounds;
 mod calibration;
 mod connection;
+mod damage;
 mod disk;
 mod errors;
 mod killed;

@@ -252,11 +252,22 @@ fn the_committed_openapi_document_is_current() {
 #[test]
 fn every_operation_is_described_with_its_errors() {
     let document = placeformer::http::openapi::document();
+    let mut ids = std::collections::BTreeSet::new();
     for (path, item) in document["paths"].as_object().unwrap() {
         for (method, operation) in item.as_object().unwrap() {
             let name = format!("{method} {path}");
             assert!(operation["summary"].as_str().is_some_and(|summary| !summary.is_empty()), "{name}");
-            assert!(operation["operationId"].is_string(), "{name}");
+            let id = operation["operationId"].as_str().unwrap_or_default();
+            assert!(!id.is_empty() && ids.insert(id.to_owned()), "{name}: operationId {id:?} is missing or used twice");
+            for (status, response) in
+                operation["responses"].as_object().unwrap().iter().filter(|(s, _)| s.as_str() < "300")
+            {
+                let content = response["content"].as_object().into_iter().flatten();
+                content.for_each(|(_, content)| assert!(!content["example"].is_null(), "{name} {status}: no example"));
+            }
+            if let Some(content) = operation.pointer("/requestBody/content/application~1json") {
+                assert!(content["example"].is_object(), "{name}: no example of a body");
+            }
             let failures =
                 operation["responses"].as_object().unwrap().iter().filter(|(status, _)| status.as_str() >= "400");
             for (status, response) in failures.filter(|_| path != "/readyz") {

@@ -6,6 +6,7 @@ mod table;
 
 use super::model_args::ModelOptions;
 use crate::bench::{Bench, BenchError, Limits, NAMES, Row};
+use crate::extract::pull::resolve_weights;
 use crate::extract::{ExtractError, Extractor, VitWeights};
 use crate::kernels;
 use anyhow::{Context, ensure};
@@ -74,7 +75,7 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
     }
     let simd = kernels::self_check()?;
     let config = args.model.extract_config()?;
-    let path = args.model.weights_for(&config)?;
+    let path = resolve_weights(&config)?;
     let weights = VitWeights::load(&path, config.preset, config.heads)?;
     let extractor = Arc::new(Extractor::from_weights(&config, &weights, &config.head)?);
     let (folder, _temporary) = folder(args.data.as_deref())?;

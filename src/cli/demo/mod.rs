@@ -8,7 +8,7 @@ mod report;
 mod server;
 
 use super::client::{ServerArgs, ServerClient};
-use crate::extract::{ExtractConfig, pull::resolve_model};
+use crate::extract::{ExtractConfig, pull::resolve_weights};
 use anyhow::{Context, bail, ensure};
 use report::{Asked, Evidence};
 use serde_json::Value;
@@ -48,7 +48,7 @@ pub struct DemoArgs {
 pub fn run(args: DemoArgs) -> anyhow::Result<()> {
     let town = args.out.join("town");
     prepare(&args.out)?;
-    resolve_model(ExtractConfig::default().preset, false).context("the demo needs the default model")?;
+    resolve_weights(&ExtractConfig::default()).context("the demo needs the default model")?;
 
     println!("\n1. Draw a town of {} places, {} photos each", args.places, args.views);
     let (places, views, seed) = (args.places.to_string(), args.views.to_string(), args.seed.to_string());

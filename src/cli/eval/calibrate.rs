@@ -68,7 +68,7 @@ pub(super) fn run(args: CalibrateArgs) -> anyhow::Result<()> {
     args.rerank.check()?;
     let dataset = args.data.load()?;
     let extract = args.model.extract_config()?;
-    let described = Described::new(&args.model, &extract, &args.output.cache, &dataset, GlobalKind::Head)?;
+    let described = Described::new(&extract, &args.output.cache, &dataset, GlobalKind::Head)?;
     let own = OwnPlaces::of(&dataset, args.fit.leave_out, args.data.radius);
     let answered = described.answer(&dataset, own.as_ref(), args.rerank.candidates, Some(&args.rerank.config()))?;
     let answers = BestAnswers::of(&dataset, &answered.answers, &answered.left_out);

@@ -256,7 +256,7 @@ impl CacheArgs {
 impl RerankArgs {
     fn check(&self) -> anyhow::Result<()> {
         ensure!(self.candidates > 0, "--candidates must be at least 1");
-        Ok(())
+        Ok(self.config().check()?)
     }
 
     fn config(&self) -> RerankConfig {
@@ -278,8 +278,8 @@ struct Answered {
     seconds: QuerySeconds,
 }
 
-fn describer(model: &ModelOptions, config: &ExtractConfig) -> anyhow::Result<ModelDescriber> {
-    Ok(ModelDescriber { extractor: model.open(config)?, limits: ImageConfig::default() })
+fn describer(config: &ExtractConfig) -> anyhow::Result<ModelDescriber> {
+    Ok(ModelDescriber { extractor: Extractor::open(config)?, limits: ImageConfig::default() })
 }
 
 /// Both sides of a data set, described.
@@ -291,14 +291,8 @@ struct Described {
 }
 
 impl Described {
-    fn new(
-        model: &ModelOptions,
-        extract: &ExtractConfig,
-        cache: &CacheArgs,
-        dataset: &Dataset,
-        global: GlobalKind,
-    ) -> anyhow::Result<Self> {
-        let describer = describer(model, extract)?;
+    fn new(extract: &ExtractConfig, cache: &CacheArgs, dataset: &Dataset, global: GlobalKind) -> anyhow::Result<Self> {
+        let describer = describer(extract)?;
         let cache = FeatureCache::open(&cache.folder()?, &describer, cache.patch_memory << 20)?;
         let images = dataset.database.len() + dataset.queries.len();
         let bar = bar(images as u64, "describing");
@@ -348,7 +342,7 @@ impl Described {
 
 fn measure(args: &MeasureArgs, dataset: &Dataset, extract: &ExtractConfig) -> anyhow::Result<Measured> {
     let given = args.method.calibration.as_deref().map(read_calibration).transpose()?;
-    let described = Described::new(&args.model, extract, &args.output.cache, dataset, args.method.global)?;
+    let described = Described::new(extract, &args.output.cache, dataset, args.method.global)?;
     let candidates = args.method.rerank.candidates;
     let rerank = (!args.method.no_rerank).then(|| args.method.rerank.config());
     if let Some(given) = &given {
@@ -427,7 +421,7 @@ fn run_ablation(
         memory_bytes: args.output.cache.patch_memory << 20,
     };
     let open = |config: &ExtractConfig| -> Result<Box<dyn Describe>, EvalError> {
-        let describer = describer(&args.model, config).map_err(|error| EvalError::Setting(format!("{error:#}")))?;
+        let describer = describer(config).map_err(|error| EvalError::Setting(format!("{error:#}")))?;
         Ok(Box::new(describer))
     };
     Ok(ablate(dataset, &base, &open, &MultiProgress::new())?)

@@ -11,6 +11,7 @@ mod sink;
 mod store_sink;
 mod verdict;
 
+use crate::config::ModelOverrides;
 use crate::eval::datasets::{UtmZone, list_images};
 use crate::types::{ContentHash, ExternalId, MapName};
 use anyhow::{Context, bail, ensure};
@@ -65,6 +66,9 @@ pub struct ImportArgs {
     /// Write a verdict per photo as JSON lines.
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
+    /// The model behind --data; a server has its own.
+    #[command(flatten)]
+    model: ModelOverrides,
 }
 
 /// Runs it.
@@ -97,6 +101,9 @@ pub fn run(args: ImportArgs) -> anyhow::Result<()> {
 fn open_sink(args: &ImportArgs) -> anyhow::Result<Box<dyn Sink>> {
     match (&args.server, &args.data) {
         (Some(url), _) => {
+            let ModelOverrides { preset, weights: _, head, precision } = &args.model;
+            let given = preset.is_some() || head.is_some() || precision.is_some();
+            ensure!(!given, "--preset, --head and --precision go with --data: a server has its own model");
             let settings = http_sink::Settings {
                 url: url.clone(),
                 api_key: args.api_key.clone(),
@@ -105,7 +112,9 @@ fn open_sink(args: &ImportArgs) -> anyhow::Result<Box<dyn Sink>> {
             };
             Ok(Box::new(http_sink::HttpSink::new(settings)?))
         }
-        (None, Some(data)) => Ok(Box::new(store_sink::StoreSink::open(data, args.config.as_deref())?)),
+        (None, Some(data)) => {
+            Ok(Box::new(store_sink::StoreSink::open(data, args.config.as_deref(), args.model.clone())?))
+        }
         (None, None) => bail!("give --server or --data"),
     }
 }

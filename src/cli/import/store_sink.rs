@@ -1,10 +1,9 @@
 //! Straight into a store, through the same pipeline as the server, without the server.
 
 use super::sink::{Outcome, Sent, Sink, Upload};
-use crate::config::{Config, Overrides};
+use crate::config::{Config, ModelOverrides, Overrides};
 use crate::error::ErrorCode;
 use crate::extract::Extractor;
-use crate::extract::pull::resolve_model;
 use crate::ops::{Health, Metrics};
 use crate::pipeline::{IngestRequest, Parts, PipelineError, Service};
 use crate::store::SqliteStore;
@@ -25,14 +24,13 @@ pub(super) struct StoreSink {
 const PAGE: usize = 1000;
 
 impl StoreSink {
-    /// Loads the model and opens the store in `data` with the settings of `config`.
-    pub(super) fn open(data: &Path, config: Option<&Path>) -> anyhow::Result<Self> {
-        let overrides = Overrides { data: Some(data.to_owned()), ..Default::default() };
+    /// Loads the model and opens the store in `data` with the settings of `config`, `model` above them.
+    pub(super) fn open(data: &Path, config: Option<&Path>, model: ModelOverrides) -> anyhow::Result<Self> {
+        let overrides = Overrides { data: Some(data.to_owned()), model, ..Default::default() };
         let config = Config::load(config, &overrides)?;
         crate::kernels::self_check()?;
-        let weights = resolve_model(config.extract.preset, false).context("cannot obtain the model")?;
-        let extractor = Extractor::load(&config.extract, &weights, None)?;
-        let store = SqliteStore::open(data, &Default::default())?;
+        let extractor = Extractor::open(&config.extract).context("cannot load the model")?;
+        let store = SqliteStore::open(data, &config.store)?;
         let service = Service::start(Parts {
             store: Arc::new(store),
             source: Arc::new(extractor),

@@ -2,6 +2,7 @@
 
 use super::head::{Source, fit};
 use super::{RunArgs, bar, facts, finish, notes, show};
+use crate::extract::pull::resolve_weights;
 use crate::extract::{Aggregate, ExtractConfig, Extractor, Head, HeadChoice, VitWeights};
 use crate::image::ImageConfig;
 use crate::train::{Augmentation, BackboneModel, Progress, Session, TrainError, TrainableBlocks, TripletSet};
@@ -19,7 +20,7 @@ pub(super) fn train(args: &RunArgs, blocks: TrainableBlocks, augmentation: Augme
         "blocks are trained under the mean of the tokens, and this head takes {}",
         start.aggregate()
     );
-    let weights = VitWeights::load(&args.model.weights_for(&extract)?, extract.preset, extract.heads)?;
+    let weights = VitWeights::load(&resolve_weights(&extract)?, extract.preset, extract.heads)?;
     let (spec, images) = (extract.encoder_spec()?, ImageConfig::default());
     let model = BackboneModel::new(weights, spec, start.weights(), blocks, images, augmentation)?;
     let identity = format!(
@@ -38,7 +39,7 @@ pub(super) fn train(args: &RunArgs, blocks: TrainableBlocks, augmentation: Augme
     let (path, head) = (args.out.join("weights.safetensors"), args.out.join("head.safetensors"));
     let backbone = || -> Result<String, TrainError> {
         let config = ExtractConfig { head: HeadChoice::None, ..extract.clone() };
-        Ok(Extractor::load(&config, &path, None)?.backbone().to_owned())
+        Ok(Extractor::load(&config, &path)?.backbone().to_owned())
     };
     let notes = notes(args, &spec.input_size.to_string(), &sides.description, &outcome);
     model.save(&path, &head, backbone, notes)?;
@@ -54,7 +55,7 @@ pub(super) fn train(args: &RunArgs, blocks: TrainableBlocks, augmentation: Augme
 
 /// The head given, or a PCA of the training images. The encoder that finds it is gone before training needs the room.
 fn starting_head(args: &RunArgs, extract: &ExtractConfig, training: &TripletSet) -> anyhow::Result<Head> {
-    let extractor = args.model.open(extract)?;
+    let extractor = Extractor::open(extract)?;
     match extractor.head() {
         Some(head) => Ok(head.clone()),
         None => {

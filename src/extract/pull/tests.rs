@@ -160,7 +160,7 @@ fn what_is_not_the_model_never_reaches_the_cache() {
     let (mock, dir) = (Mock::of(body()), tempfile::tempdir().unwrap());
     let target = dir.path().join("model.safetensors");
     let hub = hub(mock.start());
-    let puller = Puller { target: target.clone(), preset: Preset::Dinov2Vits14, hub, wheel: false };
+    let puller = Puller { target: target.clone(), preset: Preset::Dinov2Vits14, hub, wheel: false, offline: false };
     let error = puller.pull(false).unwrap_err().to_string();
     assert!(error.contains("dinov2-vits14 could not be fetched") && error.contains("safetensors"), "{error}");
     assert!(!target.exists());
@@ -172,7 +172,10 @@ fn an_unreachable_hub_is_named_in_the_message() {
     let target = dir.path().join("model.safetensors");
     // Port 9 (discard) is closed on any machine that runs tests.
     let hub = hub("http://127.0.0.1:9".into());
-    let error = Puller { target, preset: Preset::Dinov2Vits14, hub, wheel: false }.pull(false).unwrap_err().to_string();
+    let error = Puller { target, preset: Preset::Dinov2Vits14, hub, wheel: false, offline: false }
+        .pull(false)
+        .unwrap_err()
+        .to_string();
     assert!(error.contains("Tried:") && error.contains("http://127.0.0.1:9/facebook/dinov2-small"), "{error}");
 }
 
@@ -185,6 +188,57 @@ fn a_damaged_cached_model_is_noticed() {
     record.save(&target).unwrap();
     assert!(matches!(super::super::record::verify(&target), Err(ExtractError::HashMismatch { .. })));
     let hub = hub("http://127.0.0.1:9".into());
-    let puller = Puller { target, preset: Preset::Dinov2Vits14, hub, wheel: false };
+    let puller = Puller { target, preset: Preset::Dinov2Vits14, hub, wheel: false, offline: false };
     assert!(matches!(puller.pull(false), Err(PullError::AllFailed { .. })), "it must try to fetch it again");
+}
+
+/// Weights of the default preset's shapes, all zero.
+fn zero_weights() -> VitWeights {
+    use crate::extract::weights::{BlockWeights, Linear, Norm};
+    let preset = Preset::Dinov2Vits14;
+    let geometry = preset.geometry();
+    let (dim, mlp, position_grid) = (geometry.dim, geometry.mlp_dim, (37, 37));
+    let linear = |from: usize, to: usize| Linear { weight: vec![0.0; from * to], bias: vec![0.0; to] };
+    let norm = || Norm { weight: vec![0.0; dim], bias: vec![0.0; dim] };
+    let block = || BlockWeights {
+        norm1: norm(),
+        qkv: linear(dim, 3 * dim),
+        proj: linear(dim, dim),
+        layer_scale1: Some(vec![0.0; dim]),
+        norm2: norm(),
+        fc1: linear(dim, mlp),
+        fc2: linear(mlp, dim),
+        layer_scale2: Some(vec![0.0; dim]),
+    };
+    VitWeights {
+        preset,
+        geometry,
+        position_grid,
+        patch_embed: linear(3 * geometry.patch * geometry.patch, dim),
+        cls_token: vec![0.0; dim],
+        positions: vec![0.0; (1 + position_grid.0 * position_grid.1) * dim],
+        blocks: (0..geometry.depth).map(|_| block()).collect(),
+        norm: norm(),
+        unused_parameters: 0,
+    }
+}
+
+#[test]
+fn well_formed_weights_that_are_not_the_presets_count_as_a_source_that_failed() {
+    let dir = tempfile::tempdir().unwrap();
+    let other = dir.path().join("other.safetensors");
+    zero_weights().save(&other).unwrap();
+    let mock = Mock::of(std::fs::read(&other).unwrap());
+    std::fs::remove_file(other).unwrap();
+    let target = dir.path().join("model.safetensors");
+    let preset = Preset::Dinov2Vits14;
+    let hub = hub(mock.start());
+    let error = Puller { target: target.clone(), preset, hub, wheel: false, offline: false }.pull(false).unwrap_err();
+    let PullError::AllFailed { tried, .. } = &error else { panic!("the next source would not be tried: {error}") };
+    assert!(tried[0].contains("other weights") && tried[0].contains(preset.content_sha256().unwrap()), "{tried:?}");
+    assert!(!target.exists());
+    let parts = std::fs::read_dir(dir.path())
+        .unwrap()
+        .filter(|entry| entry.as_ref().unwrap().path().extension().is_some_and(|extension| extension == "part"));
+    assert_eq!(parts.count(), 0, "what can never become the model is not kept");
 }

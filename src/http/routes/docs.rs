@@ -9,7 +9,7 @@ use utoipa_swagger_ui::{Config, SwaggerUi};
 /// The OpenAPI document
 ///
 /// This description, as JSON (OpenAPI 3.1).
-#[utoipa::path(get, path = "/openapi.json", tag = "service", responses(
+#[utoipa::path(get, path = "/openapi.json", operation_id = "openapi_json", tag = "service", responses(
     (status = 200, description = "The document.", body = Object, content_type = "application/json"),
 ))]
 pub async fn openapi_json() -> Response {

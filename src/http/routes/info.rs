@@ -50,7 +50,7 @@ pub struct LimitsBody {
 /// What this server runs
 ///
 /// Its version, its model, and the bounds of requests.
-#[utoipa::path(get, path = "/info", tag = "service", responses(
+#[utoipa::path(get, path = "/info", operation_id = "info", tag = "service", responses(
     (status = 200, description = "Version, model and bounds.", body = InfoBody),
 ))]
 pub async fn info(State(state): State<AppState>) -> Result<Json<InfoBody>, ApiError> {

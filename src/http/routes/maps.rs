@@ -62,7 +62,7 @@ pub struct MapDeleted {
 /// List maps
 ///
 /// All of them, by name.
-#[utoipa::path(get, path = "/maps", tag = "maps", responses(
+#[utoipa::path(get, path = "/maps", operation_id = "list_maps", tag = "maps", responses(
     (status = 200, description = "All maps.", body = MapList),
 ))]
 pub async fn list(State(state): State<AppState>) -> Result<Json<MapList>, ApiError> {
@@ -77,7 +77,7 @@ fn parse_name(text: &str) -> Result<MapName, ApiError> {
 /// One map
 ///
 /// With the model it is bound to and its size.
-#[utoipa::path(get, path = "/maps/{map}", tag = "maps",
+#[utoipa::path(get, path = "/maps/{map}", operation_id = "get_map", tag = "maps",
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 200, description = "The map.", body = MapBody),
 ))]
@@ -88,7 +88,7 @@ pub async fn get(State(state): State<AppState>, Path(map): Path<String>) -> Resu
 /// Delete a map
 ///
 /// With every reference in it.
-#[utoipa::path(delete, path = "/maps/{map}", tag = "maps",
+#[utoipa::path(delete, path = "/maps/{map}", operation_id = "delete_map", tag = "maps",
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 200, description = "It is gone.", body = MapDeleted),
 ))]
@@ -101,7 +101,7 @@ pub async fn delete(State(state): State<AppState>, Path(map): Path<String>) -> R
 ///
 /// From the next query on, `matched` and `confidence` come from this. `placeformer eval calibrate` fits it. It must
 /// have been fitted for the map's model and this server's re-ranking, else the answer is 409 with both identities.
-#[utoipa::path(put, path = "/maps/{map}/calibration", tag = "maps", request_body = Calibration,
+#[utoipa::path(put, path = "/maps/{map}/calibration", operation_id = "calibrate_map", tag = "maps", request_body = Calibration,
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 200, description = "The calibration as it is stored.", body = Calibration),
 ))]
@@ -119,7 +119,7 @@ pub async fn calibrate(
 /// Remove a map's calibration
 ///
 /// The model's own is in force again, if it has one.
-#[utoipa::path(delete, path = "/maps/{map}/calibration", tag = "maps",
+#[utoipa::path(delete, path = "/maps/{map}/calibration", operation_id = "uncalibrate_map", tag = "maps",
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 204, description = "The map has no calibration of its own."),
 ))]
@@ -138,7 +138,7 @@ pub async fn uncalibrate(State(state): State<AppState>, Path(map): Path<String>)
 ///
 /// A head made for another backbone or another pooling of tokens is refused with both identities (409). One head can be
 /// given at a time (503).
-#[utoipa::path(put, path = "/maps/{map}/head", tag = "maps",
+#[utoipa::path(put, path = "/maps/{map}/head", operation_id = "give_map_head", tag = "maps",
     request_body(content = String, content_type = "application/octet-stream"),
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 200, description = "The map with its new model.", body = MapBody),
@@ -157,7 +157,7 @@ pub async fn rehead(
 ///
 /// As with `PUT`, but with the head that the server itself runs, which the map then goes along with. This is also how a
 /// map made by a server with another head is brought over to this one.
-#[utoipa::path(delete, path = "/maps/{map}/head", tag = "maps",
+#[utoipa::path(delete, path = "/maps/{map}/head", operation_id = "remove_map_head", tag = "maps",
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 200, description = "The map with the server's model.", body = MapBody),
 ))]

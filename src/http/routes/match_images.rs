@@ -92,7 +92,7 @@ pub struct CorrespondenceBody {
 ///
 /// Send the images as the multipart parts `query` and `reference`, as base64 in JSON under the same names, or the
 /// query as the raw body with `reference_id`.
-#[utoipa::path(post, path = "/match", tag = "query", params(MatchParams), responses(
+#[utoipa::path(post, path = "/match", operation_id = "match_images", tag = "query", params(MatchParams), responses(
     (status = 200, description = "The correspondences and homographies.", body = MatchAnswerBody),
 ))]
 pub async fn match_images(State(state): State<AppState>, request: Request) -> Result<Response, ApiError> {

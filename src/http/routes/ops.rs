@@ -42,7 +42,7 @@ pub struct ProgressBody {
 /// Is the process alive?
 ///
 /// Answers as long as the process can answer anything. Restart it when it does not.
-#[utoipa::path(get, path = "/livez", tag = "service", responses(
+#[utoipa::path(get, path = "/livez", operation_id = "livez", tag = "service", responses(
     (status = 200, description = "It is.", body = LiveBody),
 ))]
 pub async fn livez() -> Json<LiveBody> {
@@ -74,7 +74,7 @@ enum ReadyFor {
 /// 503 with the reason while it cannot; send requests elsewhere meanwhile, do not restart it. A balancer should ask
 /// `/readyz?for=query`: a full disk (`disk_full`) keeps a server from storing, which it answers with 507 itself, but
 /// not from answering queries and deleting.
-#[utoipa::path(get, path = "/readyz", tag = "service", params(ReadyParams), responses(
+#[utoipa::path(get, path = "/readyz", operation_id = "readyz", tag = "service", params(ReadyParams), responses(
     (status = 200, description = "It can.", body = ReadyBody),
     (status = 503, description = "It cannot: `status` says why.", body = ReadyBody),
 ))]
@@ -102,7 +102,7 @@ fn answer(unready: Option<Unready>) -> Response {
 /// Metrics for Prometheus
 ///
 /// In the text exposition format.
-#[utoipa::path(get, path = "/metrics", tag = "service", responses(
+#[utoipa::path(get, path = "/metrics", operation_id = "metrics", tag = "service", responses(
     (status = 200, description = "All series.", body = String, content_type = "text/plain"),
 ))]
 pub async fn metrics(State(state): State<AppState>) -> Result<Response, ApiError> {

@@ -187,7 +187,7 @@ fn scores(score: &PairScore) -> BTreeMap<String, CombinationBody> {
 ///
 /// The image is the raw body with the options as query parameters, or a multipart part `image` beside a part `json`,
 /// or base64 in JSON beside the options.
-#[utoipa::path(post, path = "/query", tag = "query", params(QueryParams), responses(
+#[utoipa::path(post, path = "/query", operation_id = "query", tag = "query", params(QueryParams), responses(
     (status = 200, description = "The ranked places; none if the map, or what the filter leaves of it, is empty.",
         body = QueryAnswerBody, headers(("server-timing" = String, description = "Milliseconds per stage."))),
 ))]

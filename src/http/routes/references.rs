@@ -78,7 +78,7 @@ impl ReferenceParams {
 ///
 /// Acknowledged only after it is durable and can be found. The image is the raw body with the fields as query
 /// parameters, or a multipart part `image` beside a part `json`, or base64 in JSON beside the fields.
-#[utoipa::path(post, path = "/references", tag = "references", params(ReferenceParams), responses(
+#[utoipa::path(post, path = "/references", operation_id = "create_reference", tag = "references", params(ReferenceParams), responses(
     (status = 201, description = "It is new, durable and can be found.", body = ReferenceBody,
         headers(("location" = String, description = "Its path."))),
     (status = 200, description = "The same photo was there before under this external id.", body = ReferenceBody),
@@ -167,7 +167,7 @@ pub struct ReferencePage {
 /// List references
 ///
 /// In the order they were added, page by page.
-#[utoipa::path(get, path = "/references", tag = "references", params(ListParams), responses(
+#[utoipa::path(get, path = "/references", operation_id = "list_references", tag = "references", params(ListParams), responses(
     (status = 200, description = "A page.", body = ReferencePage),
 ))]
 pub async fn list(State(state): State<AppState>, uri: Uri) -> Result<Json<ReferencePage>, ApiError> {
@@ -195,7 +195,7 @@ fn parse_id(text: &str) -> Result<ReferenceId, ApiError> {
 /// One reference
 ///
 /// Its metadata; the image itself is not kept.
-#[utoipa::path(get, path = "/references/{id}", tag = "references",
+#[utoipa::path(get, path = "/references/{id}", operation_id = "get_reference", tag = "references",
     params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
     (status = 200, description = "The reference.", body = ReferenceBody),
 ))]
@@ -206,7 +206,6 @@ pub async fn get(State(state): State<AppState>, Path(id): Path<String>) -> Resul
 /// Fields to change: one left out stays as it is, null clears it.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
-#[schema(example = json!({"heading": 90, "metadata": null}))]
 pub struct ReferenceChange {
     /// Your own name for the photo.
     #[schema(min_length = 1, max_length = 256, value_type = Option<String>)]
@@ -258,7 +257,7 @@ impl ReferenceChange {
 /// Change a reference's metadata
 ///
 /// The photo and what was computed from it stay. A new position is used by the next query.
-#[utoipa::path(patch, path = "/references/{id}", tag = "references", request_body = ReferenceChange,
+#[utoipa::path(patch, path = "/references/{id}", operation_id = "update_reference", tag = "references", request_body = ReferenceChange,
     params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
     (status = 200, description = "The reference as it is now.", body = ReferenceBody),
 ))]
@@ -275,7 +274,7 @@ pub async fn update(
 /// Delete a reference
 ///
 /// It is found by no query that begins after the answer.
-#[utoipa::path(delete, path = "/references/{id}", tag = "references",
+#[utoipa::path(delete, path = "/references/{id}", operation_id = "delete_reference", tag = "references",
     params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
     (status = 204, description = "It is gone."),
 ))]

@@ -33,6 +33,11 @@ pub(super) fn failed(context: &'static str) -> impl Fn(rusqlite::Error) -> Store
         {
             StoreError::Busy { context }
         }
+        rusqlite::Error::SqliteFailure(cause, _)
+            if matches!(cause.code, SqliteCode::DatabaseCorrupt | SqliteCode::NotADatabase) =>
+        {
+            StoreError::Damaged { context, source: EngineCause::from(error) }
+        }
         _ => StoreError::Engine { context, source: EngineCause::from(error) },
     }
 }

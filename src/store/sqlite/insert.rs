@@ -66,8 +66,8 @@ pub(super) fn check_global(global: &[f32]) -> Result<(), StoreError> {
     Ok(())
 }
 
-/// Stores `new` inside the writer's transaction; also returns the number of a damaged reference it took the place of.
-pub(super) fn insert(connection: &Connection, new: &Prepared) -> Result<(Inserted, Option<i64>), StoreError> {
+/// Stores `new` inside the writer's transaction; also returns the damaged reference it took the place of.
+pub(super) fn insert(connection: &Connection, new: &Prepared) -> Result<(Inserted, Option<Replaced>), StoreError> {
     let map = match MapRow::find(connection, &new.map)? {
         Some(map) if map.model != new.model => {
             return Err(StoreError::ModelMismatch { map: new.map.clone(), bound: map.model, given: new.model.clone() });
@@ -80,7 +80,7 @@ pub(super) fn insert(connection: &Connection, new: &Prepared) -> Result<(Inserte
         match holder(connection, &map, external_id, new.content_hash)? {
             Holder::Nobody => {}
             Holder::SameContent(existing) => return Ok((Inserted::AlreadyThere(*existing), None)),
-            Holder::Removed(number) => healed = Some(number),
+            Holder::Removed(replaced) => healed = Some(replaced),
         }
     }
     let writing = failed("writing a reference");
@@ -128,8 +128,11 @@ enum Holder {
     Nobody,
     SameContent(Box<Reference>),
     /// It was damaged and is removed: sending its image again is how a map is healed.
-    Removed(i64),
+    Removed(Replaced),
 }
+
+/// A damaged reference that made way for its image sent again: its number, and its identity as far as it can be read.
+pub(super) type Replaced = (i64, ReferenceId);
 
 /// Looks up the holder of an external id; an error if its content is another.
 fn holder(
@@ -156,8 +159,9 @@ fn holder(
             existing: existing.id,
         }),
         Ok(_) | Err(RowError::Damaged(_)) => {
+            let id = rows::id_of(connection, number);
             remove(connection, map, number).map_err(&looking)?;
-            Ok(Holder::Removed(number))
+            Ok(Holder::Removed((number, id)))
         }
         Err(RowError::Engine(error)) => Err(looking(error)),
     }

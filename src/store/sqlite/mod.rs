@@ -27,15 +27,16 @@ mod writer;
 
 use self::directory::{DataDirectory, Reserve};
 use self::engine::Readers;
-use self::insert::Prepared;
+use self::insert::{Prepared, Replaced};
 use self::quarantine::Quarantine;
 use self::rows::MapRow;
 use self::writer::{Effect, Pending, Writer};
 use super::{
-    GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined, ReferencePatch, StoreConfig,
-    StoreError, VerifyReport,
+    Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined, ReferencePatch,
+    StoreConfig, StoreError, VerifyReport,
 };
 use crate::types::{Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId};
+use rusqlite::Connection;
 use std::path::{Path, PathBuf};
 
 /// A store in one directory, shared by all threads of one process.
@@ -71,6 +72,16 @@ impl SqliteStore {
         Ok(Self { writer, readers, quarantine, path, config: config.clone(), _directory: claimed })
     }
 
+    /// Name of the database inside a data directory.
+    pub const DATABASE: &str = directory::DATABASE;
+
+    /// As [`PlaceStore::backup`], of the store in a directory that another process may have open: only its database is
+    /// read. `target` must not exist.
+    pub fn backup_of(directory: &Path, config: &StoreConfig, target: &Path) -> Result<u64, StoreError> {
+        let path = directory.join(directory::DATABASE);
+        backup::write(&engine::open_reader(&path, config)?, target)
+    }
+
     /// Takes a damaged reference out of service and records why.
     fn put_in_quarantine(&self, number: i64, map: i64, id: ReferenceId, reason: &str) {
         if !self.quarantine.add(number, map, id, reason) {
@@ -78,21 +89,42 @@ impl SqliteStore {
         }
         tracing::error!(reference = %id, reason, "a stored reference is damaged; it is quarantined");
         let owned = reason.to_owned();
-        let record = move |connection: &rusqlite::Connection| change::quarantine(connection, number, map, id, &owned);
+        let record = move |connection: &Connection| change::quarantine(connection, number, map, id, &owned);
         if let Err(error) = self.writer.run(Effect::Shrinks, record) {
             // It stays out of service while this process lives and will be found again by the next.
             tracing::warn!(%error, reference = %id, "cannot record the quarantine");
         }
     }
 
-    fn submit_insert(&self, new: NewReference) -> Result<Pending<(Inserted, Option<i64>)>, StoreError> {
+    /// Reads with a connection from the pool; damage that no single record answers for is counted here.
+    fn reading<T>(&self, work: impl FnOnce(&Connection) -> Result<T, StoreError>) -> Result<T, StoreError> {
+        self.noticing(self.readers.with(work))
+    }
+
+    /// Writes, and waits until it is durable; as [`Self::reading`].
+    fn writing<T: Send + 'static>(
+        &self,
+        effect: Effect,
+        work: impl FnMut(&Connection) -> Result<T, StoreError> + Send + 'static,
+    ) -> Result<T, StoreError> {
+        self.noticing(self.writer.run(effect, work))
+    }
+
+    fn noticing<T>(&self, outcome: Result<T, StoreError>) -> Result<T, StoreError> {
+        outcome.inspect_err(|error| match error {
+            StoreError::Damaged { .. } | StoreError::CorruptMap { .. } => self.quarantine.met(error.to_string(), None),
+            _ => {}
+        })
+    }
+
+    fn submit_insert(&self, new: NewReference) -> Result<Pending<(Inserted, Option<Replaced>)>, StoreError> {
         let prepared = Prepared::new(new)?;
         self.writer.submit(Effect::Grows(prepared.bytes()), move |connection| insert::insert(connection, &prepared))
     }
 
-    fn finish_insert(&self, pending: Pending<(Inserted, Option<i64>)>) -> Result<Inserted, StoreError> {
-        let (inserted, healed) = pending.wait()?;
-        healed.into_iter().for_each(|number| self.quarantine.forget(number));
+    fn finish_insert(&self, pending: Pending<(Inserted, Option<Replaced>)>) -> Result<Inserted, StoreError> {
+        let (inserted, healed) = self.noticing(pending.wait())?;
+        healed.into_iter().for_each(|(number, id)| self.quarantine.replaced(number, id));
         Ok(inserted)
     }
 
@@ -115,44 +147,46 @@ impl PlaceStore for SqliteStore {
     }
 
     fn get(&self, id: ReferenceId) -> Result<Reference, StoreError> {
-        self.readers.with(|connection| self.read_reference(connection, id))
+        self.reading(|connection| self.read_reference(connection, id))
     }
 
     fn find_external(&self, map: &MapName, external_id: &ExternalId) -> Result<Option<Reference>, StoreError> {
-        self.readers.with(|connection| self.read_external(connection, map, external_id))
+        self.reading(|connection| self.read_external(connection, map, external_id))
     }
 
     fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, StoreError> {
         self.get(id)?;
-        self.writer.run(Effect::Grows(1024), move |connection| change::update(connection, id, patch.clone()))
+        self.writing(Effect::Grows(1024), move |connection| change::update(connection, id, patch.clone()))
     }
 
     fn delete(&self, id: ReferenceId) -> Result<Reference, StoreError> {
-        let (number, reference) = self.writer.run(Effect::Shrinks, move |connection| change::delete(connection, id))?;
+        let (number, reference) = self.writing(Effect::Shrinks, move |connection| change::delete(connection, id))?;
         self.quarantine.forget(number);
         Ok(reference)
     }
 
     fn list(&self, map: Option<&MapName>, after: Option<ReferenceId>, limit: usize) -> Result<Page, StoreError> {
-        self.readers.with(|connection| self.read_page(connection, map, after, limit))
+        self.reading(|connection| self.read_page(connection, map, after, limit))
     }
 
     fn maps(&self) -> Result<Vec<MapInfo>, StoreError> {
-        let (maps, damaged) = self.readers.with(MapRow::all)?;
+        let (maps, damaged) = self.reading(MapRow::all)?;
         for map in damaged {
-            tracing::error!(map, "the record of this map is damaged; restore a backup");
+            let error = StoreError::CorruptMap { map };
+            tracing::error!(%error, "a map is not served");
+            self.quarantine.met(error.to_string(), None);
         }
         Ok(maps.into_iter().map(|map| self.info(map)).collect())
     }
 
     fn map(&self, name: &MapName) -> Result<MapInfo, StoreError> {
-        self.readers.with(|connection| MapRow::require(connection, name)).map(|map| self.info(map))
+        self.reading(|connection| MapRow::require(connection, name)).map(|map| self.info(map))
     }
 
     fn delete_map(&self, name: &MapName) -> Result<u64, StoreError> {
         let name = name.clone();
         let (number, references) =
-            self.writer.run(Effect::Shrinks, move |connection| change::delete_map(connection, &name))?;
+            self.writing(Effect::Shrinks, move |connection| change::delete_map(connection, &name))?;
         super::crash_points::reach(super::crash_points::MAP_DELETED);
         let damaged = self.quarantine.count(number);
         self.quarantine.forget_map(number);
@@ -160,7 +194,7 @@ impl PlaceStore for SqliteStore {
     }
 
     fn get_many(&self, ids: &[ReferenceId]) -> Result<Vec<Reference>, StoreError> {
-        self.readers.with(|connection| {
+        self.reading(|connection| {
             let mut references = Vec::with_capacity(ids.len());
             for &id in ids {
                 match self.read_reference(connection, id) {
@@ -174,11 +208,11 @@ impl PlaceStore for SqliteStore {
     }
 
     fn patches(&self, id: ReferenceId) -> Result<PackedPatches, StoreError> {
-        self.readers.with(|connection| self.read_patches(connection, id))
+        self.reading(|connection| self.read_patches(connection, id))
     }
 
     fn scan_globals(&self, map: &MapName, visit: &mut dyn FnMut(GlobalRow)) -> Result<(), StoreError> {
-        self.readers.with(|connection| {
+        self.reading(|connection| {
             // One snapshot: a head exchanged meanwhile must not pull the version away.
             let scanning = engine::failed("reading global vectors");
             let snapshot = connection.unchecked_transaction().map_err(&scanning)?;
@@ -197,12 +231,17 @@ impl PlaceStore for SqliteStore {
 
     fn set_calibration(&self, map: &MapName, calibration: Option<Calibration>) -> Result<(), StoreError> {
         let map = map.clone();
-        self.writer
-            .run(Effect::Grows(2048), move |connection| change::set_calibration(connection, &map, calibration.as_ref()))
+        self.writing(Effect::Grows(2048), move |connection| {
+            change::set_calibration(connection, &map, calibration.as_ref())
+        })
     }
 
     fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError> {
         Ok(self.quarantine.list())
+    }
+
+    fn drain_damage(&self) -> Damage {
+        self.quarantine.drain()
     }
 
     fn verify(&self) -> Result<VerifyReport, StoreError> {

@@ -64,8 +64,7 @@ impl SqliteStore {
     ) -> Result<(), StoreError> {
         let (mut last, mut finishing) = (0, false);
         loop {
-            let Batch { sources, newest } =
-                self.readers.with(|connection| self.pooled_behind(connection, number, last))?;
+            let Batch { sources, newest } = self.reading(|connection| self.pooled_behind(connection, number, last))?;
             let Some(newest) = newest else {
                 if !finishing {
                     exchange.finishing();
@@ -131,7 +130,7 @@ impl SqliteStore {
                 Ok(source) if self.quarantine.contains(number) => batch.sources.push(Source { row: None, ..source }),
                 Ok(source) => batch.sources.push(source),
                 Err(RowError::Damaged(reason)) => {
-                    self.put_in_quarantine(number, map, self.id_of(connection, number), &reason);
+                    self.put_in_quarantine(number, map, rows::id_of(connection, number), &reason);
                 }
                 Err(RowError::Engine(error)) => return Err(reading(error)),
             }

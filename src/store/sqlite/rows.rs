@@ -313,7 +313,8 @@ pub(super) fn read_reference(row: &Row<'_>) -> Result<Reference, RowError> {
     columns.reference(map, ModelId::new(row.get::<_, String>(13)?))
 }
 
-/// A reference's number and its map's, from the index alone, whatever the state of its row.
+/// A reference's number and its map's, from the index alone, whatever the state of its row. Where that cannot be read,
+/// it is this reference that is damaged: others may lie on sound pages.
 pub(super) fn locate(connection: &Connection, id: ReferenceId) -> Result<(i64, i64), StoreError> {
     let sql = "SELECT r.number, r.map FROM reference r JOIN map m ON m.number = r.map AND m.name IS NOT NULL
                WHERE r.id = ?1";
@@ -322,8 +323,18 @@ pub(super) fn locate(connection: &Connection, id: ReferenceId) -> Result<(i64, i
         .and_then(|mut statement| {
             statement.query_row([id.as_bytes().as_slice()], |row| Ok((row.get(0)?, row.get(1)?))).optional()
         })
-        .map_err(failed("finding a reference"))?
+        .map_err(|error| match damage(&error) {
+            Some(reason) => StoreError::Corrupt { id, reason },
+            None => failed("finding a reference")(error),
+        })?
         .ok_or(StoreError::ReferenceNotFound { id })
+}
+
+/// The identity in a row that may be unreadable otherwise; all zeros where even that is lost.
+pub(super) fn id_of(connection: &Connection, number: i64) -> ReferenceId {
+    let sql = "SELECT id FROM reference WHERE number = ?1";
+    let id = connection.query_row(sql, [number], |row| row.get(0));
+    ReferenceId::from_bytes(id.unwrap_or([0; 16]))
 }
 
 /// The reference of this number.

@@ -22,7 +22,7 @@ impl SqliteStore {
             }
             match self.verify_map(connection, map, &mut report) {
                 // Where the engine itself gives up on a map, the others are still worth checking.
-                Err(error @ StoreError::Engine { .. }) => {
+                Err(error @ (StoreError::Engine { .. } | StoreError::Damaged { .. })) => {
                     report.engine_errors.push(format!("map {}: {error}", map.name))
                 }
                 outcome => outcome?,
