@@ -3,7 +3,7 @@
 #[path = "common/places.rs"]
 mod places;
 
-use placeformer::search::{IndexEntry, MapIndex};
+use placeformer::search::{IndexBuilder, IndexEntry, MapIndex};
 use placeformer::store::{Inserted, PlaceStore, SqliteStore, StoreConfig};
 use placeformer::types::{GLOBAL_DIM, MapName, NewReference, Reference, ReferenceFilter, ReferenceId};
 use places::{map, named_reference, reference, unit_vector};
@@ -14,7 +14,7 @@ fn open(directory: &std::path::Path) -> SqliteStore {
 }
 
 fn rebuild(store: &SqliteStore, map: &MapName) -> MapIndex {
-    let mut entries = Vec::new();
+    let mut entries = IndexBuilder::default();
     if store.map(map).is_ok() {
         store
             .scan_globals(map, &mut |row| {
@@ -23,7 +23,7 @@ fn rebuild(store: &SqliteStore, map: &MapName) -> MapIndex {
             })
             .unwrap();
     }
-    MapIndex::build(entries)
+    entries.finish()
 }
 
 fn entry(reference: &Reference, new: &NewReference) -> IndexEntry {

@@ -1,4 +1,5 @@
-//! From an open store to a service: every map's index is rebuilt from the store, in parallel, with visible progress.
+//! From an open store to a service: every map's index is rebuilt from the store, the maps beside each other and each
+//! map's blocks while its next references are read, with visible progress.
 
 use super::admission::Admission;
 use super::extraction::Extraction;
@@ -10,7 +11,7 @@ use crate::image::ImageConfig;
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::{Health, Metrics};
 use crate::rerank::{RerankConfig, Reranker};
-use crate::search::{IndexEntry, MapIndex};
+use crate::search::{IndexBuilder, IndexEntry, MapIndex};
 use crate::store::{MapInfo, PlaceStore};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -89,7 +90,7 @@ fn build_index(
         entry.put(LiveMap::new(model, MapIndex::default(), info.calibration.clone()));
         return Ok(());
     }
-    let mut entries = Vec::with_capacity(info.references as usize);
+    let mut entries = IndexBuilder::default();
     store.scan_globals(&info.name, &mut |row| {
         entries.push(IndexEntry {
             id: row.reference,
@@ -103,6 +104,6 @@ fn build_index(
     })?;
     health.indexed(entries.len() as u64 % PROGRESS_STEP);
     tracing::info!(map = %info.name, references = entries.len(), "indexed");
-    entry.put(LiveMap::new(model, MapIndex::build(entries), info.calibration.clone()));
+    entry.put(LiveMap::new(model, entries.finish(), info.calibration.clone()));
     Ok(())
 }

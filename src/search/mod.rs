@@ -14,11 +14,13 @@
 //! blocks are mostly sorted by themselves and their id ranges disjoint; neither is relied upon.
 
 mod block;
+mod build;
 mod filter;
 mod list;
 mod scan;
 
 use self::block::{Block, CAPACITY, Quantised, Sealed};
+pub use self::build::IndexBuilder;
 use self::filter::Sieve;
 use self::list::BlockList;
 use self::scan::{Part, Query, Top};
@@ -95,8 +97,12 @@ impl MapIndex {
         let tail = Block::of(entries.drain(len - len % CAPACITY..));
         let sealed: Vec<Sealed> =
             entries.into_par_iter().chunks(CAPACITY).map(|chunk| Sealed::new(Block::of(chunk))).collect();
+        Self::of(BlockList::new(sealed), tail, highest, len)
+    }
+
+    /// An index of `len` references in sealed blocks and a tail.
+    fn of(sealed: BlockList, tail: Block, highest: Option<ReferenceId>, len: usize) -> Self {
         let tail_rows = tail.ids.iter().copied().zip(0..).collect();
-        let sealed = BlockList::new(sealed);
         Self { state: RwLock::new(State { sealed, tail, tail_rows, highest, len }) }
     }
 
