@@ -1,7 +1,9 @@
 //! Re-ranking 100 candidates at the caps (400 + 200 + 50 key patches of 384 values), with 40%, 15% and no planted
 //! inliers: ours against what one would write first, in the same run.
 //!
-//! Both use all cores. `ours_matching_only` is ours with no homography tried.
+//! Both use all cores. `ours_matching_only` is ours with no homography tried, `ours_from_store` ours with the candidates
+//! in a store, to be loaded and decoded each time; `load` is that alone. `ransac` is the homographies alone, on one
+//! thread.
 //!
 //! `PLACEFORMER_BENCH_EXPORT=DIR` writes the same data as safetensors for `benches/peers/rerank_opencv.py`, along with
 //! our inlier counts, and stops.
@@ -9,9 +11,12 @@
 use criterion::{BenchmarkId, Criterion};
 use placeformer::bench::baselines::{self, joined};
 use placeformer::bench::scenes::{CANDIDATES, CAPS, DIM, RerankScene};
+use placeformer::bench::store_scene;
 use placeformer::kernels::simd;
 use placeformer::rerank::{RerankConfig, Reranked, Reranker};
+use placeformer::store::PlaceStore;
 use placeformer::types::{PackedPatches, ScaleSet};
+use rayon::prelude::*;
 use std::hint::black_box;
 use std::path::Path;
 
@@ -62,6 +67,50 @@ fn cpu_ms<T>(work: impl FnOnce() -> T) -> (f64, T) {
     (spent().saturating_sub(before) as f64 / 1e6, result)
 }
 
+/// Correspondences of every candidate and combination.
+fn matches(reranker: &Reranker, query: &PackedPatches, candidates: &[PackedPatches]) -> Vec<Vec<[f32; 4]>> {
+    let points = |candidate: &PackedPatches| {
+        let of_pair = |from: u32, to: u32| {
+            let ([x, y], [u, v]) = (query.centre(from as usize), candidate.centre(to as usize));
+            [x, y, u, v]
+        };
+        let found = reranker.explain(query, candidate).into_iter();
+        found
+            .map(|found| found.correspondences.iter().map(|pair| of_pair(pair.query, pair.reference)).collect())
+            .collect::<Vec<_>>()
+    };
+    candidates.iter().flat_map(points).collect()
+}
+
+/// The homographies alone, on one thread, and what a store adds.
+fn bench_parts(criterion: &mut Criterion, percent: u32, scene: &RerankScene) {
+    let query = PackedPatches::quantise(&scene.query);
+    let candidates: Vec<_> = scene.candidates.iter().map(PackedPatches::quantise).collect();
+    let reranker = Reranker::new(RerankConfig::default());
+    let problems = matches(&reranker, &query, &candidates);
+    let mut group = criterion.benchmark_group("ransac");
+    group.sample_size(10);
+    group.bench_function(BenchmarkId::new("300 homographies", format!("{percent}%")), |b| {
+        b.iter(|| problems.iter().filter_map(|points| reranker.homography(black_box(points), 21.0)).count());
+    });
+    group.finish();
+
+    let folder = tempfile::tempdir().unwrap();
+    let (store, ids) = store_scene(scene, folder.path()).unwrap();
+    let load = |i: usize| store.patches(ids[i]).map(Box::new);
+    let mut group = criterion.benchmark_group("rerank_100");
+    group.sample_size(10);
+    group.bench_function(BenchmarkId::new("ours_from_store", format!("{percent}%")), |b| {
+        b.iter(|| reranker.rerank(&query, ids.len(), load, None));
+    });
+    group.bench_function(BenchmarkId::new("load", format!("{percent}%")), |b| {
+        b.iter(|| {
+            (0..ids.len()).into_par_iter().filter_map(|i| load(i).ok()).map(|patches| patches.len()).sum::<usize>()
+        });
+    });
+    group.finish();
+}
+
 fn bench(criterion: &mut Criterion, percent: u32, scene: &RerankScene) {
     let query = PackedPatches::quantise(&scene.query);
     let candidates: Vec<_> = scene.candidates.iter().map(PackedPatches::quantise).collect();
@@ -90,7 +139,10 @@ fn main() {
         let scene = RerankScene::new(f64::from(percent) / 100.0);
         match &export_to {
             Some(dir) => export(Path::new(dir), percent, &scene),
-            None => bench(&mut criterion, percent, &scene),
+            None => {
+                bench(&mut criterion, percent, &scene);
+                bench_parts(&mut criterion, percent, &scene);
+            }
         }
     }
     criterion.final_summary();

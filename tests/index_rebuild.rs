@@ -9,7 +9,7 @@ use bytes::Bytes;
 use placeformer::config::Config;
 use placeformer::error::ErrorCode;
 use placeformer::pipeline::{IngestRequest, QueryOptions, QueryRequest, Service};
-use placeformer::search::{IndexEntry, MapIndex};
+use placeformer::search::{IndexBuilder, IndexEntry, MapIndex};
 use placeformer::store::{Inserted, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, apply_patch};
 use placeformer::types::{
     ContentHash, GLOBAL_DIM, GeoCircle, GeoPoint, MapName, NewReference, Reference, ReferenceFields, ReferenceFilter,
@@ -274,7 +274,7 @@ fn open(directory: &std::path::Path) -> SqliteStore {
 }
 
 fn rebuild(store: &SqliteStore, map: &MapName) -> MapIndex {
-    let mut entries = Vec::new();
+    let mut entries = IndexBuilder::default();
     if store.map(map).is_ok() {
         store
             .scan_globals(map, &mut |row| {
@@ -283,7 +283,7 @@ fn rebuild(store: &SqliteStore, map: &MapName) -> MapIndex {
             })
             .unwrap();
     }
-    MapIndex::build(entries)
+    entries.finish()
 }
 
 fn entry(reference: &Reference, new: &NewReference) -> IndexEntry {

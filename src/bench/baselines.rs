@@ -1,6 +1,6 @@
 //! What one would write first: correct, parallel, and without a kernel of its own.
 
-use super::scenes::{DIM, RerankScene};
+use super::scenes::RerankScene;
 use crate::image::{DEVIATION, MEAN};
 use crate::types::{GLOBAL_DIM, ImageSize, KeyPatches, ScaleSet};
 use candle_core::{Device, Tensor};
@@ -94,8 +94,12 @@ fn mutual_pairs(
     (reference, reference_centres): (Vec<f32>, Centres),
 ) -> Result<Vec<PointPair>, candle_core::Error> {
     let (n, m) = (query_centres.len(), reference_centres.len());
-    let query = Tensor::from_vec(query, (n, DIM), &Device::Cpu)?;
-    let reference = Tensor::from_vec(reference, (m, DIM), &Device::Cpu)?;
+    if n == 0 || m == 0 {
+        return Ok(Vec::new());
+    }
+    let dim = query.len() / n;
+    let query = Tensor::from_vec(query, (n, dim), &Device::Cpu)?;
+    let reference = Tensor::from_vec(reference, (m, dim), &Device::Cpu)?;
     let similarity = query.matmul(&reference.t()?)?;
     let forth = similarity.argmax(1)?.to_vec1::<u32>()?;
     let back = similarity.argmax(0)?.to_vec1::<u32>()?;

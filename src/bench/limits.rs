@@ -30,7 +30,7 @@ impl Limits {
         let giga = |per_thread: Vec<Option<f64>>| per_thread.into_iter().sum::<Option<f64>>().map(|sum| sum / 1e9);
         let all = |work: &(dyn Fn() -> Option<f64> + Sync)| giga(rayon::broadcast(|_| work()));
         Self {
-            f32_gflops: all(&|| Some(peak::f32_operations(simd, TIME))).unwrap_or(f64::NAN),
+            f32_gflops: rayon::broadcast(|_| peak::f32_operations(simd, TIME)).into_iter().sum::<f64>() / 1e9,
             bf16_gflops: all(&|| peak::bf16_operations(simd, TIME)),
             int8_gops: all(&|| peak::int8_operations(simd, TIME)),
             read_gbytes: read_bandwidth() / 1e9,
@@ -46,6 +46,11 @@ impl Limits {
             () if encoder.contains("bf16") => (bf16, 2.0 / (1.0 / bf16 + 1.0 / self.f32_gflops)),
             () => (self.f32_gflops, self.f32_gflops),
         }
+    }
+
+    /// Milliseconds that reading or writing so many bytes takes.
+    pub(super) fn memory_ms(&self, bytes: f64) -> f64 {
+        Self::milliseconds(bytes, self.read_gbytes)
     }
 
     /// Milliseconds that `operations` take at `giga` operations a second.

@@ -6,18 +6,20 @@
 //! | `measure` | ours and the baseline in turn, so that what disturbs one disturbs the other |
 //! | [`scenes`] | the inputs: a drawn photo, key patches with planted inliers, random references |
 //! | [`baselines`] | the plain implementations |
-//! | `stages` | the rows |
+//! | `stages`, `candidates` | the rows |
 //! | [`filled`] | a store that shows more references than it holds |
 //!
 //! The Criterion benchmarks use the same inputs and baselines.
 
 pub mod baselines;
+mod candidates;
 pub mod filled;
 mod limits;
 mod measure;
 pub mod scenes;
 mod stages;
 
+pub use candidates::store_scene;
 pub use limits::Limits;
 pub use stages::{Bench, BenchError, NAMES, REFERENCE_SIZE, fill_with_streets, street_map};
 
@@ -36,19 +38,35 @@ pub struct Row {
     pub baseline_ms: f64,
     /// How many times faster ours is.
     pub ratio: f64,
-    /// The time that the machine's limit allows at best, divided by ours; absent where no limit is known.
-    pub limit_share: Option<f64>,
+    /// The time that the machine's limit allows at best, divided by ours. Above 1 where memory is the limit and the
+    /// data fit a cache.
+    pub limit_share: f64,
 }
 
 impl Row {
-    fn new(name: &str, baseline: &str, (ours_ms, baseline_ms): (f64, f64), limit_ms: Option<f64>) -> Self {
-        Self {
-            name: name.to_owned(),
-            ours_ms,
-            baseline: baseline.to_owned(),
-            baseline_ms,
-            ratio: baseline_ms / ours_ms,
-            limit_share: limit_ms.map(|limit| limit / ours_ms),
+    /// # Errors
+    /// A figure is not a finite number, which a report could not hold.
+    fn new(name: &str, baseline: &str, (ours_ms, baseline_ms): (f64, f64), limit_ms: f64) -> Result<Self, BenchError> {
+        let (ratio, limit_share) = (baseline_ms / ours_ms, limit_ms / ours_ms);
+        if !(ratio.is_finite() && limit_share.is_finite()) {
+            return Err(BenchError::NotComparable { row: name.to_owned(), ours_ms, baseline_ms, limit_ms });
+        }
+        Ok(Self { name: name.to_owned(), ours_ms, baseline: baseline.to_owned(), baseline_ms, ratio, limit_share })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_figure_of_a_row_is_a_number() {
+        let row = Row::new("a", "b", (2.0, 6.0), 1.0).unwrap();
+        assert_eq!((row.ratio, row.limit_share), (3.0, 0.5));
+        for (times, limit) in
+            [((0.0, 1.0), 1.0), ((f64::NAN, 1.0), 1.0), ((1.0, f64::NAN), 1.0), ((1.0, 1.0), f64::NAN)]
+        {
+            assert!(matches!(Row::new("a", "b", times, limit), Err(BenchError::NotComparable { .. })));
         }
     }
 }

@@ -14,8 +14,11 @@ use rand_chacha::ChaCha8Rng;
 /// # Errors
 /// The encoder's.
 pub fn photo() -> Result<Vec<u8>, ImageError> {
-    street(0, 0, ImageSize { width: 1920, height: 1080 })
+    street(0, 0, PHOTO_SIZE)
 }
+
+/// Size of the [`photo`].
+pub const PHOTO_SIZE: ImageSize = ImageSize { width: 1920, height: 1080 };
 
 /// A JPEG of place `place`, seen as the `view`th time.
 ///

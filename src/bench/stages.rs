@@ -1,26 +1,27 @@
 //! The rows: each stage of a query, and all of them together.
 
+use super::candidates::dequantised;
 use super::filled::FilledStore;
 use super::limits::Limits;
 use super::measure::{median, paired};
-use super::scenes::{CANDIDATES, CAPS, DIM, RerankScene, index_entry, photo, street, unit_vector};
+use super::scenes::{CANDIDATES, DIM, PHOTO_SIZE, RerankScene, index_entry, photo, street, unit_vector};
 use super::{Row, baselines};
 use crate::extract::{
     CandleEncoder, Encoder, EncoderSpec, ExtractError, Extractor, Geometry, Precision, VitWeights, build_encoder,
 };
 use crate::image::{ImageConfig, ImageError, load_tensor};
+use crate::kernels::scan::ROW_BYTES;
 use crate::ops::{Health, Metrics};
 use crate::pipeline::{Parts, PipelineConfig, PipelineError, QueryOptions, QueryRequest, Service};
-use crate::rerank::{RerankConfig, Reranked, Reranker};
+use crate::rerank::RerankConfig;
 use crate::search::{IndexEntry, MapIndex};
 use crate::store::{Inserted, PlaceStore, SqliteStore, StoreConfig, StoreError};
 use crate::types::{
-    ContentHash, GLOBAL_DIM, ImageSize, ImageTensor, MapName, NewReference, PackedPatches, ReferenceFields,
-    ReferenceFilter, ReferenceId, ScaleSet,
+    ContentHash, ImageSize, ImageTensor, MapName, NewReference, ReferenceFields, ReferenceFilter, ReferenceId,
 };
 use bytes::Bytes;
 use rayon::prelude::*;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 /// The rows there are, in the order they are measured. `search_10m` takes 14 GB and runs only when it is named.
@@ -66,6 +67,18 @@ pub enum BenchError {
         row: &'static str,
         /// How.
         difference: String,
+    },
+    /// A quotient of two times that is not a number, such as where none passed.
+    #[error("{row}: {ours_ms} ms beside {baseline_ms} ms with a limit of {limit_ms} ms cannot be compared")]
+    NotComparable {
+        /// The row.
+        row: String,
+        /// Ours.
+        ours_ms: f64,
+        /// The baseline's.
+        baseline_ms: f64,
+        /// The limit.
+        limit_ms: f64,
     },
     /// From the image room.
     #[error(transparent)]
@@ -151,7 +164,26 @@ impl Bench {
             || load_tensor(&bytes, &ImageConfig::default(), size),
             || baselines::load_tensor(&bytes, size),
         );
-        Ok(Row::new("decode_resize_1080p", "image crate", times, None))
+        Row::new("decode_resize_1080p", "image crate", times, self.decode_limit_ms(bytes.len()))
+    }
+
+    /// Milliseconds of memory traffic: the photo is read, its pixels written and read again, the tensor written.
+    fn decode_limit_ms(&self, photo_bytes: usize) -> f64 {
+        let pixels = |size: ImageSize| 3.0 * f64::from(size.width) * f64::from(size.height);
+        self.limits.memory_ms(photo_bytes as f64 + 2.0 * pixels(PHOTO_SIZE) + 4.0 * pixels(self.spec.input_size))
+    }
+
+    /// Milliseconds of reading what a scan reads of each reference. Memory is the limit of large maps; one that fits
+    /// the caches may beat it.
+    fn search_limit_ms(&self, references: u64) -> f64 {
+        self.limits.memory_ms(references as f64 * ROW_BYTES as f64)
+    }
+
+    /// Milliseconds that an encoder of this name takes for one image at least.
+    fn encode_limit_ms(&self, encoder: &str) -> f64 {
+        let (layers, attention) = encoder_operations(&self.weights.geometry, &self.spec);
+        let (of_layers, of_attention) = self.limits.encoder_giga_operations(encoder);
+        Limits::milliseconds(layers, of_layers) + Limits::milliseconds(attention, of_attention)
     }
 
     fn extract(&self, name: &str, precision: Precision, batch: usize) -> Result<Row, BenchError> {
@@ -165,57 +197,9 @@ impl Bench {
         agree("extract", cosine > 0.995, || format!("the tokens' cosine is {cosine}"))?;
         let (ours_ms, plain_ms) = paired(self.rounds, || ours.encode(&images), || plain.encode(&images));
         let times = (ours_ms / batch as f64, plain_ms / batch as f64);
-        let (layers, attention) = encoder_operations(&self.weights.geometry, &self.spec);
-        let (of_layers, of_attention) = self.limits.encoder_giga_operations(&ours.name());
-        let limit = Limits::milliseconds(layers, of_layers) + Limits::milliseconds(attention, of_attention);
+        let limit = self.encode_limit_ms(&ours.name());
         let baseline = format!("candle f32 (ours: {})", ours.name());
-        Ok(Row::new(name, &baseline, times, Some(limit)))
-    }
-
-    fn load(&self) -> Result<Row, BenchError> {
-        let (store, ids) = self.store_of_streets()?;
-        let files = self.folder.join("plain");
-        let kept = |path: &Path| {
-            let path = path.to_owned();
-            move |source| BenchError::Io { path: path.clone(), source }
-        };
-        std::fs::create_dir_all(&files).map_err(kept(&files))?;
-        for id in &ids {
-            let patches = store.patches(*id)?;
-            let floats = |(code, row): (&i8, usize)| (f32::from(*code) * patches.factor[row]).to_le_bytes();
-            let rows = (0..patches.codes.len()).map(|at| at / patches.dim);
-            let bytes: Vec<u8> = patches.codes.iter().zip(rows).flat_map(floats).collect();
-            let path = files.join(id.to_string());
-            std::fs::write(&path, bytes).map_err(kept(&path))?;
-        }
-        let plain = |id: &ReferenceId| {
-            let bytes = std::fs::read(files.join(id.to_string())).unwrap_or_default();
-            bytes.as_chunks::<4>().0.iter().map(|value| f32::from_le_bytes(*value)).collect::<Vec<f32>>()
-        };
-        let times = paired(
-            10 * self.rounds,
-            || ids.par_iter().map(|id| store.patches(*id).map_or(0, |patches| patches.len())).sum::<usize>(),
-            || ids.par_iter().map(|id| plain(id).len()).sum::<usize>(),
-        );
-        Ok(Row::new("load_100", "one f32 file per reference", times, None))
-    }
-
-    fn rerank(&self, name: &'static str, share: f64) -> Result<Row, BenchError> {
-        let scene = RerankScene::new(share);
-        let query = PackedPatches::quantise(&scene.query);
-        let candidates: Vec<_> = scene.candidates.iter().map(PackedPatches::quantise).collect();
-        let reranker = Reranker::new(RerankConfig::default());
-        let ours = || match reranker.rerank(&query, candidates.len(), |i| Ok::<_, ()>(&candidates[i]), None) {
-            Reranked::Complete { ranked, .. } => ranked.iter().map(|r| r.score.spatial_score as usize).sum(),
-            Reranked::DeadlinePassed => 0,
-        };
-        let (our_inliers, plain_inliers): (usize, usize) = (ours(), baselines::rerank(&scene)?);
-        agree(name, our_inliers as f64 >= 0.97 * plain_inliers as f64, || {
-            format!("{our_inliers} inliers, the baseline finds {plain_inliers}")
-        })?;
-        let times = paired(self.rounds, ours, || baselines::rerank(&scene));
-        let limit = self.limits.int8_gops.map(|giga| Limits::milliseconds(matching_operations(), giga));
-        Ok(Row::new(name, "f32 GEMM and plain RANSAC", times, limit))
+        Row::new(name, &baseline, times, limit)
     }
 
     fn search(&self, name: &'static str, size: u64) -> Result<Row, BenchError> {
@@ -242,10 +226,7 @@ impl Bench {
                 (0..parts).map(|_| baselines::nearest(&vectors, query, NEAREST).len()).sum::<usize>()
             },
         );
-        let bytes = size as f64 * GLOBAL_DIM as f64;
-        // What fits the caches is not limited by memory.
-        let limit = (size >= 1_000_000).then(|| Limits::milliseconds(bytes, self.limits.read_gbytes));
-        Ok(Row::new(name, "f32 scan", times, limit))
+        Row::new(name, "f32 scan", times, self.search_limit_ms(size))
     }
 
     /// A photo through the whole service at a million references, against the sum of the plain stages.
@@ -253,9 +234,11 @@ impl Bench {
         let setup = |error: &dyn std::fmt::Display| BenchError::Setup(error.to_string());
         let runtime = tokio::runtime::Runtime::new().map_err(|error| setup(&error))?;
         let (store, ids) = self.store_of_streets()?;
+        let photo = Bytes::from(photo()?);
+        // What the service will compare the photo with: random vectors are far from it, so that the streets are nearest.
+        let scene = self.scene_of(&photo, &store, &ids)?;
         let service = self.service(store, QUERY_REFERENCES - ids.len() as u64)?;
         let map: MapName = street_map();
-        let photo = Bytes::from(photo()?);
         let ours = || {
             let request = QueryRequest { map: map.clone(), image: photo.clone(), options: QueryOptions::default() };
             runtime.block_on(service.query(request))
@@ -263,8 +246,7 @@ impl Bench {
         let answer = ours()?;
         agree("query_1m", answer.reranked, || "the answer was not re-ranked".into())?;
         let vectors: Vec<f32> = (0..QUERY_REFERENCES).into_par_iter().flat_map_iter(unit_vector).collect();
-        let (plain, scene, query) =
-            (CandleEncoder::new(&self.weights, &self.spec)?, RerankScene::new(0.15), unit_vector(1));
+        let (plain, query) = (CandleEncoder::new(&self.weights, &self.spec)?, unit_vector(1));
         let baseline = || -> Result<usize, BenchError> {
             let data = baselines::load_tensor(&photo, self.spec.input_size)?;
             let encoded = plain.encode(&[ImageTensor { size: self.spec.input_size, data }])?;
@@ -273,7 +255,33 @@ impl Bench {
         };
         baseline()?;
         let times = paired(self.rounds, ours, baseline);
-        Ok(Row::new("query_1m", "the baselines in sequence", times, None))
+        let limit = self.decode_limit_ms(photo.len())
+            + self.encode_limit_ms(&self.extractor.encoder_name())
+            + self.search_limit_ms(QUERY_REFERENCES)
+            + self.limits.candidates_ms(&scene.query, &scene.candidates);
+        Row::new("query_1m", "the baselines in sequence", times, limit)
+    }
+
+    /// The photo's key patches and those of the references it is compared with, in full precision.
+    fn scene_of(&self, photo: &[u8], store: &SqliteStore, ids: &[ReferenceId]) -> Result<RerankScene, BenchError> {
+        let tensor = load_tensor(photo, &ImageConfig::default(), self.spec.input_size)?;
+        let described = self.extractor.extract_full(&[tensor])?;
+        let query = described.into_iter().map(|(_, patches)| patches).next();
+        let query = query.ok_or_else(|| BenchError::Setup("one image gave no descriptor".into()))?;
+        let candidates: Result<Vec<_>, StoreError> =
+            ids.iter().map(|id| store.patches(*id).map(|patches| dequantised(&patches))).collect();
+        Ok(RerankScene { query, candidates: candidates? })
+    }
+
+    /// A folder of this name without anything in it.
+    pub(super) fn new_folder(&self, name: &str) -> Result<PathBuf, BenchError> {
+        let path = self.folder.join(name);
+        let failed = |source| BenchError::Io { path: path.clone(), source };
+        if path.exists() {
+            std::fs::remove_dir_all(&path).map_err(failed)?;
+        }
+        std::fs::create_dir_all(&path).map_err(failed)?;
+        Ok(path)
     }
 
     /// A service over `store` with `extra` made-up references in each map.
@@ -291,7 +299,7 @@ impl Bench {
     }
 
     /// A store with a map of [`CANDIDATES`] drawn streets, made at the first call.
-    fn store_of_streets(&self) -> Result<(SqliteStore, Vec<ReferenceId>), BenchError> {
+    pub(super) fn store_of_streets(&self) -> Result<(SqliteStore, Vec<ReferenceId>), BenchError> {
         let store = SqliteStore::open(&self.folder.join("store"), &StoreConfig::default())?;
         fill_with_streets(&store, &self.extractor, CANDIDATES as u64)?;
         let page = store.list(Some(&street_map()), None, CANDIDATES)?;
@@ -334,7 +342,7 @@ pub fn fill_with_streets(store: &SqliteStore, extractor: &Extractor, count: u64)
     Ok(())
 }
 
-fn agree(row: &'static str, yes: bool, difference: impl FnOnce() -> String) -> Result<(), BenchError> {
+pub(super) fn agree(row: &'static str, yes: bool, difference: impl FnOnce() -> String) -> Result<(), BenchError> {
     if yes { Ok(()) } else { Err(BenchError::Disagree { row, difference: difference() }) }
 }
 
@@ -365,16 +373,6 @@ fn encoder_operations(geometry: &Geometry, spec: &EncoderSpec) -> (f64, f64) {
     (2.0 * embedding + blocks * linear, blocks * attention)
 }
 
-/// Multiply-adds of comparing the key patches of every pair of scales that occurs, once each.
-fn matching_operations() -> f64 {
-    let mut pairs = std::collections::BTreeSet::new();
-    for scales in ScaleSet::paper_default() {
-        scales.scales().for_each(|a| pairs.extend(scales.scales().map(|b| (a, b))));
-    }
-    let products: usize = pairs.into_iter().map(|(a, b)| CAPS[a - 1] * CAPS[b - 1]).sum();
-    2.0 * (CANDIDATES * products * DIM) as f64
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -392,12 +390,5 @@ mod tests {
         // 257 tokens, 12 blocks: 11.0 GFLOP of linear layers, 1.2 of attention, 0.1 of the embedding.
         let (layers, attention) = encoder_operations(&preset.geometry(), &whole);
         assert!((10.9e9..11.3e9).contains(&layers) && (1.1e9..1.3e9).contains(&attention), "{layers} {attention}");
-    }
-
-    #[test]
-    fn each_pair_of_scales_is_counted_once() {
-        // 1x1, 1x2, 2x1, 2x2, 2x3, 3x2, 3x3.
-        let pairs: usize = 400 * 400 + 2 * 400 * 200 + 200 * 200 + 2 * 200 * 50 + 50 * 50;
-        assert_eq!(matching_operations(), 2.0 * (100 * pairs * 384) as f64);
     }
 }

@@ -67,8 +67,10 @@ pub fn quantise(simd: Simd, values: &[f32], divisor: f32, factor: f32, codes: &m
 #[inline(always)]
 fn quantise_all(values: &[f32], divisor: f32, factor: f32, codes: &mut [i8]) {
     for (code, value) in codes.iter_mut().zip(values) {
-        let scaled = (value / divisor * factor).clamp(-127.0, 127.0);
-        let whole = scaled as i32;
+        let scaled = value / divisor * factor;
+        let scaled = if scaled.is_nan() { 0.0 } else { scaled.clamp(-127.0, 127.0) };
+        // SAFETY: a number within -127..=127. A plain cast would saturate, which the compiler does lane by lane.
+        let whole: i32 = unsafe { scaled.to_int_unchecked() };
         // Exact, so that a half is told from what lies beside it.
         let left = scaled - whole as f32;
         *code = (whole + i32::from(left >= 0.5) - i32::from(left <= -0.5)) as i8;

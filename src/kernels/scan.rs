@@ -152,8 +152,8 @@ fn is_near(
     let group = Rows { codes: &[], scales: &scales, errors: &errors, squares: &squares, longest: rows.longest };
     let mut near = false;
     // Without a branch, so that it becomes vector code.
-    for lane in 0..GROUP {
-        (found.lower[lane], found.upper[lane]) = bounds(probe, &group, lane, dots[lane]);
+    for (lane, &dot) in dots.iter().enumerate() {
+        (found.lower[lane], found.upper[lane]) = bounds(probe, &group, lane, dot);
         near |= !(found.lower[lane] > threshold);
     }
     near

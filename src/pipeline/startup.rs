@@ -1,4 +1,5 @@
-//! From an open store to a service: every map's index is rebuilt from the store, in parallel, with visible progress.
+//! From an open store to a service: every map's index is rebuilt from the store, the maps beside each other and each
+//! map's blocks while its next references are read, with visible progress.
 
 use super::admission::{Admission, Turns};
 use super::extraction::Extraction;
@@ -12,7 +13,7 @@ use crate::image::ImageConfig;
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::{Health, Metrics};
 use crate::rerank::{RerankConfig, Reranker};
-use crate::search::{IndexEntry, MapIndex};
+use crate::search::{IndexBuilder, IndexEntry, MapIndex};
 use crate::store::{GlobalRow, MapInfo, PlaceStore, StoreError};
 use rayon::prelude::*;
 use std::path::Path;
@@ -20,9 +21,6 @@ use std::sync::Arc;
 
 /// References between two reports of progress.
 const PROGRESS_STEP: u64 = 1024;
-
-/// Most entries that a map's own count, which no checksum covers, is trusted for.
-const MOST_RESERVED: usize = 1 << 20;
 
 /// What a service is made of.
 pub struct Parts {
@@ -99,7 +97,7 @@ fn build_index(
         entry.put(LiveMap::new(model, projection, MapIndex::default(), info.calibration.clone()));
         return Ok(());
     }
-    let mut entries = Vec::with_capacity((info.references as usize).min(MOST_RESERVED));
+    let mut entries = IndexBuilder::default();
     let scanned = store.scan_globals(&info.name, &mut |row| {
         entries.push(index_entry(row));
         if (entries.len() as u64).is_multiple_of(PROGRESS_STEP) {
@@ -114,7 +112,7 @@ fn build_index(
     }
     health.indexed(entries.len() as u64 % PROGRESS_STEP);
     tracing::info!(map = %info.name, references = entries.len(), "indexed");
-    entry.put(LiveMap::new(model, projection, MapIndex::build(entries), info.calibration.clone()));
+    entry.put(LiveMap::new(model, projection, entries.finish(), info.calibration.clone()));
     Ok(())
 }
 

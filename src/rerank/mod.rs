@@ -191,6 +191,12 @@ impl Reranker {
         })
     }
 
+    /// The homography that most of `correspondences` (`x, y` in query, `u, v` in reference pixels) agree with, row-major,
+    /// and how many do to within `tolerance_px`; `None` where no four of them make a proper quadrilateral in both images.
+    pub fn homography(&self, correspondences: &[[f32; 4]], tolerance_px: f32) -> Option<([f64; 9], u32)> {
+        with_workspace(|workspace| workspace.homography(self.simd, &self.config, correspondences, tolerance_px))
+    }
+
     /// Scores `count` candidates in parallel, loading each through `load`.
     ///
     /// Runs on the rayon pool it is called in. Once the deadline has passed no further candidate is begun. A candidate

@@ -87,6 +87,20 @@ impl Workspace {
         config.scales.iter().map(one).collect()
     }
 
+    /// Verifies correspondences that were found otherwise.
+    pub(super) fn homography(
+        &mut self,
+        simd: Simd,
+        config: &RerankConfig,
+        correspondences: &[[f32; 4]],
+        tolerance_px: f32,
+    ) -> Option<([f64; 9], u32)> {
+        let RerankConfig { max_iterations, confidence, .. } = *config;
+        let settings = RansacSettings { tolerance_px, max_iterations, confidence };
+        let estimate = self.ransac.estimate(simd, correspondences.iter().copied(), &settings)?;
+        Some((scaled(estimate.homography), estimate.inliers))
+    }
+
     fn compare(&mut self, config: &RerankConfig, query: &PreparedQuery, reference: &PackedPatches) {
         self.matcher.compare(query, reference, &config.scales);
         centres_of(reference, &mut self.centres);

@@ -66,7 +66,7 @@ impl Block {
     pub(super) fn of(entries: impl IntoIterator<Item = IndexEntry>) -> Self {
         let mut block = Self::default();
         block.reserve();
-        entries.into_iter().for_each(|entry| block.push(&entry));
+        entries.into_iter().for_each(|entry| block.push(&entry, Quantised::new(&entry.global)));
         block.fit();
         block
     }
@@ -81,12 +81,11 @@ impl Block {
         Rows { codes, scales, errors, squares, longest: *longest }
     }
 
-    /// Appends one reference.
-    pub(super) fn push(&mut self, entry: &IndexEntry) {
+    /// Appends one reference, of which `quantised` is the vector.
+    pub(super) fn push(&mut self, entry: &IndexEntry, quantised: Quantised) {
         if self.ids.is_empty() {
             self.reserve();
         }
-        let quantised = Quantised::new(&entry.global);
         self.ids.push(entry.id);
         self.codes.push(quantised.codes);
         self.scales.push(quantised.scale);
@@ -184,14 +183,19 @@ pub(super) struct Sealed {
     removed: Option<std::sync::Arc<[u64]>>,
     /// Rows that still count.
     pub live: usize,
+    /// The lowest and the highest id. Here rather than read from the block, which would have to be fetched for it.
+    pub range: (ReferenceId, ReferenceId),
 }
 
 impl Sealed {
     /// Seals a block whose rows all count.
+    ///
+    /// # Panics
+    /// If there is no row.
     pub(super) fn new(block: Block) -> Self {
         let block = block.sorted();
-        let live = block.len();
-        Self { block: std::sync::Arc::new(block), removed: None, live }
+        let (live, range) = (block.len(), (block.ids[0], block.ids[block.len() - 1]));
+        Self { block: std::sync::Arc::new(block), removed: None, live, range }
     }
 
     /// Whether a row still counts.
@@ -201,12 +205,10 @@ impl Sealed {
 
     /// The row of a reference that still counts.
     pub(super) fn find(&self, id: ReferenceId) -> Option<usize> {
-        let ids = &self.block.ids;
-        let within = ids.first().is_some_and(|first| *first <= id) && ids.last().is_some_and(|last| *last >= id);
-        if !within {
+        if id < self.range.0 || id > self.range.1 {
             return None;
         }
-        ids.binary_search(&id).ok().filter(|&row| self.is_live(row))
+        self.block.ids.binary_search(&id).ok().filter(|&row| self.is_live(row))
     }
 
     /// Removes a row that counts. Searches that hold a clone of the block still see it.

@@ -4,24 +4,30 @@
 //! saved), at a million references in milliseconds, while references come and go. The scan is limited by memory
 //! bandwidth, so it reads int8 codes, a quarter of the bytes; `scan.rs` proves why the result is exact nevertheless.
 //!
-//! References live in blocks of 4096 (`block.rs`): sealed ones never change, so a search takes the list of them and
-//! scans without a lock while the index moves on; the youngest references are in one open block, the tail, which a
-//! search scans first, under a read lock of at most some 40 microseconds. Appending fills the tail, and sealing it
-//! moves it. Removing copies a bitmap of 512 bytes. Two blocks that together fit into one are merged as soon as both
+//! References live in blocks of 4096 (`block.rs`): sealed ones never change, so a search takes the list of them
+//! (`list.rs`) and scans without a lock while the index moves on; the youngest references are in one open block, the
+//! tail, which a search scans first, under a read lock of at most some 40 microseconds. Appending fills the tail, and
+//! sealing it moves it; an id above all before it, as the store's are, is not looked for. Removing copies a bitmap of 512
+//! bytes, and beside a search the names of 64 blocks. Two blocks that together fit into one are merged as soon as both
 //! are at most half alive, which costs each removal a constant share of one copy. So a search sees the index as it was
 //! at one instant, and nobody waits long for anyone. The order of the store's ids is the order of insertion, hence
 //! blocks are mostly sorted by themselves and their id ranges disjoint; neither is relied upon.
 
 mod block;
+mod build;
 mod filter;
+mod list;
 mod scan;
 
-use self::block::{Block, CAPACITY, Sealed};
+use self::block::{Block, CAPACITY, Quantised, Sealed};
+pub use self::build::IndexBuilder;
 use self::filter::Sieve;
+use self::list::BlockList;
 use self::scan::{Part, Query, Top};
 use crate::types::{GLOBAL_DIM, GeoPoint, ReferenceFilter, ReferenceId};
 use rayon::prelude::*;
-use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+use std::collections::HashMap;
+use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use time::OffsetDateTime;
 
 /// One reference as the index holds it.
@@ -59,10 +65,14 @@ pub struct MapIndex {
 
 #[derive(Default)]
 struct State {
-    /// Shared with searches under way; copied on the next change only if one still holds it.
-    sealed: Arc<Vec<Sealed>>,
+    /// Shared with searches under way.
+    sealed: BlockList,
     /// The youngest references, unsorted.
     tail: Block,
+    /// The row of each in the tail.
+    tail_rows: HashMap<ReferenceId, u32>,
+    /// Not below any id that has ever been inserted; absent as long as none was.
+    highest: Option<ReferenceId>,
     /// References in all.
     len: usize,
 }
@@ -83,11 +93,17 @@ impl MapIndex {
             }
             same
         });
-        let len = entries.len();
+        let (len, highest) = (entries.len(), entries.last().map(|entry| entry.id));
         let tail = Block::of(entries.drain(len - len % CAPACITY..));
         let sealed: Vec<Sealed> =
             entries.into_par_iter().chunks(CAPACITY).map(|chunk| Sealed::new(Block::of(chunk))).collect();
-        Self { state: RwLock::new(State { sealed: Arc::new(sealed), tail, len }) }
+        Self::of(BlockList::new(sealed), tail, highest, len)
+    }
+
+    /// An index of `len` references in sealed blocks and a tail.
+    fn of(sealed: BlockList, tail: Block, highest: Option<ReferenceId>, len: usize) -> Self {
+        let tail_rows = tail.ids.iter().copied().zip(0..).collect();
+        Self { state: RwLock::new(State { sealed, tail, tail_rows, highest, len }) }
     }
 
     /// Adds a reference, or replaces the one with its id.
@@ -96,13 +112,20 @@ impl MapIndex {
     /// If the descriptor's length is not 256.
     pub fn insert(&self, entry: IndexEntry) {
         check(&entry);
-        let mut state = self.write();
-        state.remove(entry.id);
-        state.tail.push(&entry);
+        let quantised = Quantised::new(&entry.global);
+        let mut guard = self.write();
+        let state = &mut *guard;
+        if state.highest.is_none_or(|highest| entry.id > highest) {
+            state.highest = Some(entry.id);
+        } else {
+            state.remove(entry.id);
+        }
+        state.tail_rows.insert(entry.id, state.tail.len() as u32);
+        state.tail.push(&entry, quantised);
         state.len += 1;
         if state.tail.len() == CAPACITY {
-            let full = std::mem::take(&mut state.tail);
-            Arc::make_mut(&mut state.sealed).push(Sealed::new(full));
+            state.tail_rows.clear();
+            state.sealed.push(Sealed::new(std::mem::take(&mut state.tail)));
         }
     }
 
@@ -114,11 +137,10 @@ impl MapIndex {
     /// The global descriptor of a reference, `[256]`; `None` if it is not there.
     pub fn global(&self, id: ReferenceId) -> Option<Vec<f32>> {
         let state = self.read();
-        if let Some(row) = state.tail.ids.iter().position(|&there| there == id) {
-            return Some(state.tail.vector(row).to_vec());
+        if let Some(&row) = state.tail_rows.get(&id) {
+            return Some(state.tail.vector(row as usize).to_vec());
         }
-        let (number, row) = state.find_sealed(id)?;
-        Some(state.sealed[number].block.vector(row).to_vec())
+        state.sealed.vector(id).map(<[f32]>::to_vec)
     }
 
     /// The `k` nearest that pass `filter`, nearest first, ties by ascending id. Exact; see the module.
@@ -137,20 +159,22 @@ impl MapIndex {
             let mut part = Part::default();
             part.scan_rows(&query, &state.tail, 0, |_| true);
             part.settle(&query, |_| &state.tail, &mut top);
-            Arc::clone(&state.sealed)
+            state.sealed.clone()
         };
         top.announce(&query);
-        let scan = |mut part: Part, (number, sealed): (usize, &Sealed)| {
-            part.scan(&query, sealed, number);
+        let scan = |mut part: Part, number: usize| {
+            if let Some(block) = sealed.get(number) {
+                part.scan(&query, block, number);
+            }
             part
         };
-        let part = if sealed.len() <= BLOCKS_PER_TASK {
-            sealed.iter().enumerate().fold(Part::default(), scan)
+        let part = if sealed.end() <= BLOCKS_PER_TASK {
+            (0..sealed.end()).fold(Part::default(), scan)
         } else {
-            let parts = sealed.par_iter().enumerate().with_min_len(BLOCKS_PER_TASK).fold(Part::default, scan);
+            let parts = (0..sealed.end()).into_par_iter().with_min_len(BLOCKS_PER_TASK).fold(Part::default, scan);
             parts.reduce(Part::default, |a, b| a.joined(b, &query))
         };
-        part.settle(&query, |number| &sealed[number as usize].block, &mut top);
+        part.settle(&query, |number| sealed.block(number as usize), &mut top);
         top.into_neighbours()
     }
 
@@ -167,8 +191,9 @@ impl MapIndex {
     /// Bytes on the heap.
     pub fn memory_bytes(&self) -> usize {
         let state = self.read();
-        let sealed: usize = state.sealed.iter().map(Sealed::memory_bytes).sum();
-        sealed + state.sealed.capacity() * size_of::<Sealed>() + state.tail.memory_bytes()
+        // Beside each entry of the table one byte of control; an eighth of the table stays free.
+        let rows = state.tail_rows.capacity() * 8 / 7 * (size_of::<(ReferenceId, u32)>() + 1);
+        state.sealed.memory_bytes() + state.tail.memory_bytes() + rows
     }
 
     // A panic while writing can only come from running out of memory; what is there stays consistent enough to read.
@@ -187,34 +212,16 @@ fn check(entry: &IndexEntry) {
 
 impl State {
     fn remove(&mut self, id: ReferenceId) -> bool {
-        if let Some(row) = self.tail.ids.iter().position(|&there| there == id) {
-            self.tail.swap_remove(row);
-        } else if let Some((number, row)) = self.find_sealed(id) {
-            let sealed = Arc::make_mut(&mut self.sealed);
-            sealed[number].remove(row);
-            compact(sealed, number);
-        } else {
+        if let Some(row) = self.tail_rows.remove(&id) {
+            self.tail.swap_remove(row as usize);
+            if let Some(&moved) = self.tail.ids.get(row as usize) {
+                self.tail_rows.insert(moved, row);
+            }
+        } else if !self.sealed.remove(id) {
             return false;
         }
         self.len -= 1;
         true
-    }
-
-    fn find_sealed(&self, id: ReferenceId) -> Option<(usize, usize)> {
-        self.sealed.iter().enumerate().find_map(|(number, sealed)| Some((number, sealed.find(id)?)))
-    }
-}
-
-/// Merges the block a row was removed from with another, if both are at most half alive.
-fn compact(sealed: &mut Vec<Sealed>, number: usize) {
-    let sparse = |sealed: &Sealed| sealed.live <= CAPACITY / 2;
-    if sealed[number].live == 0 {
-        sealed.swap_remove(number);
-    } else if sparse(&sealed[number])
-        && let Some(other) = (0..sealed.len()).find(|&other| other != number && sparse(&sealed[other]))
-    {
-        sealed[number] = sealed[number].merged(&sealed[other]);
-        sealed.swap_remove(other);
     }
 }
 
