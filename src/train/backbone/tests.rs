@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::extract::{BlockWeights, CandleEncoder, Encoder, Geometry, Linear, Norm, Preset};
-use crate::image::encode_png;
+use crate::image::{RgbImage, encode_png};
 use crate::synth::{Condition, StreetWorld, Viewpoint};
 use crate::train::loss::triplet_margin_loss;
 use crate::train::triplets::Side;
@@ -153,24 +153,29 @@ fn every_tensor_can_be_written_back_by_name() {
     assert!(!copy.replace("blocks.9.norm1.weight", &[0.0; 8]));
 }
 
-/// Eight places of a drawn town, three views of each.
+/// Eight places of a drawn town, two views of each.
 fn drawn_places(folder: &Path) -> TripletSet {
     let town = StreetWorld::new(5);
-    let mut images = Vec::new();
-    for place in 0..8u64 {
-        for view in 0..3 {
-            let viewpoint = Viewpoint { along_m: f64::from(view) * 0.6, across_m: 0.0, turn_deg: 0.0 };
-            let size = ImageSize { width: 64, height: 48 };
-            let picture = town.render(3 * place, viewpoint, Condition::Day, size);
-            let path = folder.join(format!("{place}-{view}.png"));
-            std::fs::write(&path, encode_png(&picture).unwrap()).unwrap();
-            images.push(path);
-        }
-    }
-    let group = |image: u32| (image / 3 * 3)..(image / 3 * 3 + 3);
+    let picture = |image: u64| {
+        let viewpoint = Viewpoint { along_m: (image % 2) as f64 * 0.6, across_m: 0.0, turn_deg: 0.0 };
+        town.render(image / 2 * 3, viewpoint, Condition::Day, ImageSize { width: 32, height: 24 })
+    };
+    eight_places(folder, picture)
+}
+
+/// Eight places of two pictures each.
+fn eight_places(folder: &Path, picture: impl Fn(u64) -> RgbImage) -> TripletSet {
+    let images: Vec<_> = (0..16)
+        .map(|image| {
+            let path = folder.join(format!("{image}.png"));
+            std::fs::write(&path, encode_png(&picture(image)).unwrap()).unwrap();
+            path
+        })
+        .collect();
+    let group = |image: u32| (image / 2 * 2)..(image / 2 * 2 + 2);
     TripletSet {
-        positives: (0..24).map(|image| group(image).filter(|&other| other != image).collect()).collect(),
-        near: (0..24).map(|image| group(image).collect()).collect(),
+        positives: (0..16).map(|image| group(image).filter(|&other| other != image).collect()).collect(),
+        near: (0..16).map(|image| group(image).collect()).collect(),
         queries: images.clone(),
         database: images,
     }
@@ -180,7 +185,7 @@ fn config(total: u64) -> TrainConfig {
     TrainConfig {
         schedule: Schedule { peak: 0.01, warm_up: 10, total },
         batch: 8,
-        steps_per_cycle: 10,
+        steps_per_cycle: 20,
         patience: 1000,
         augmentation: Augmentation::NONE,
         ..TrainConfig::default()
@@ -214,7 +219,7 @@ fn values(model: &BackboneModel) -> Vec<(String, Vec<f32>)> {
 fn eight_drawn_places_are_learnt_to_zero_loss() {
     let folder = tempfile::tempdir().unwrap();
     let set = drawn_places(folder.path());
-    let (_, outcome) = train_in(&folder.path().join("run"), &set, &config(300), u64::MAX).unwrap();
+    let (_, outcome) = train_in(&folder.path().join("run"), &set, &config(240), u64::MAX).unwrap();
     assert!(outcome.initial.at_1 < 100.0, "{outcome:?}");
     assert_eq!((outcome.last_loss, outcome.best.at_1), (0.0, 100.0), "{outcome:?}");
 }
@@ -224,10 +229,10 @@ fn an_interrupted_run_of_blocks_continues_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
     let set = drawn_places(folder.path());
     // Varied images too: their variations follow from the seed.
-    let config = TrainConfig { augmentation: Augmentation::default(), ..config(30) };
+    let config = TrainConfig { augmentation: Augmentation::default(), ..config(60) };
     let (whole, broken) = (folder.path().join("whole"), folder.path().join("broken"));
     let (straight, expected) = train_in(&whole, &set, &config, u64::MAX).unwrap();
-    assert!(train_in(&broken, &set, &config, 20).is_none());
+    assert!(train_in(&broken, &set, &config, 40).is_none());
     let (continued, outcome) = train_in(&broken, &set, &config, u64::MAX).unwrap();
     assert_eq!(outcome, expected);
     assert_eq!(values(&continued), values(&straight));
@@ -237,16 +242,20 @@ fn an_interrupted_run_of_blocks_continues_bit_for_bit() {
 #[test]
 fn gradients_through_head_and_loss_agree_with_finite_differences() {
     let folder = tempfile::tempdir().unwrap();
-    let set = drawn_places(folder.path());
+    let noise = |seed| {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let pixels = (0..3 * SIZE.width * SIZE.height).map(|_| rng.random()).collect();
+        RgbImage { size: SIZE, pixels }
+    };
+    let set = eight_places(folder.path(), noise);
     let model = model(TrainableBlocks::All, true);
     let sample = |side, index| Sample { side, index, variation: None };
     // Two triplets; the margin is so wide that both count.
-    let samples =
-        [0, 6, 1, 7, 12, 2].map(|index| sample(if index % 6 == 0 { Side::Query } else { Side::Database }, index));
+    let samples = [0, 6, 1, 7, 12, 2].map(|index| sample(Side::Database, index));
     let value = || {
         let descriptors = model.embed(&set, &samples).unwrap();
         let part = |role: usize| descriptors.narrow(0, role * 2, 2).unwrap();
-        triplet_margin_loss(&part(0), &part(1), &part(2), 4.0).unwrap()
+        triplet_margin_loss(&part(0), &part(1), &part(2), 1.0).unwrap()
     };
     let gradients = value().backward().unwrap();
     let names = [
@@ -273,9 +282,9 @@ fn gradients_through_head_and_loss_agree_with_finite_differences() {
         let numeric = (shifted(step) - shifted(-step)) / f64::from(2.0 * step);
         variable.set(&start).unwrap();
         let analytic = f64::from(analytic[at]);
-        assert!(analytic.abs() > 1e-3, "{name}: no gradient to speak of, {analytic}");
+        assert!(analytic.abs() > 5e-4, "{name}: no gradient to speak of, {analytic}");
         assert!(
-            (numeric - analytic).abs() < 0.03 * analytic.abs() + 2e-4,
+            (numeric - analytic).abs() < 0.03 * analytic.abs() + 5e-5,
             "{name}[{at}]: {numeric} against {analytic}"
         );
     }
