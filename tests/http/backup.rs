@@ -1,7 +1,7 @@
 //! `placeformer backup`: a copy of the store that another process is serving.
 
-use crate::process::Server;
-use crate::support::{App, FakeSource, picture};
+use crate::process::{Server, source};
+use crate::support::{App, picture};
 use std::path::Path;
 use std::process::{Command, Output};
 use std::sync::Arc;
@@ -35,7 +35,7 @@ async fn a_store_is_copied_while_it_is_served_and_after() {
     }
     assert!(!again.status.success() && String::from_utf8_lossy(&again.stderr).contains("exists already"));
     for (copy, references) in [(live, 3), (stopped, 4)] {
-        let app = App::open(copy, FakeSource::new("fake-1"), |_| {});
+        let app = App::open(copy, source(), |_| {});
         assert_eq!(app.count().await, references);
         let answer = app.post_png("/query?map=m&top_k=1", 2).await;
         assert_eq!(answer.ok()["results"][0]["external_id"], "2");

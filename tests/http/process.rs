@@ -17,6 +17,11 @@ const DIRECTORY: &str = "PLACEFORMER_TEST_SERVED";
 /// Set: the server logs JSON.
 const LOGGED: &str = "PLACEFORMER_TEST_LOGGED";
 
+/// The model of the child, to open its store with.
+pub fn source() -> Arc<FakeSource> {
+    FakeSource::with_head(head(1, BACKBONE, Aggregate::Mean))
+}
+
 /// Settings of the store behind the server.
 pub fn store_config() -> StoreConfig {
     StoreConfig { reserve_bytes: 1 << 20, ..StoreConfig::default() }
@@ -34,7 +39,7 @@ fn child_that_serves_until_it_is_killed() {
     config.pipeline.disk_reserve_bytes = 0;
     let (data, store) = (config.data.directory.clone(), config.store.clone());
     let loaders = Loaders {
-        source: Box::new(|| Ok(FakeSource::with_head(head(1, BACKBONE, Aggregate::Mean)))),
+        source: Box::new(|| Ok(source())),
         store: Box::new(move || Ok(Arc::new(SqliteStore::open(&data, &store)?))),
     };
     tokio::runtime::Runtime::new().unwrap().block_on(async {
