@@ -6,8 +6,8 @@ mod places;
 use placeformer::error::ErrorCode;
 use placeformer::store::{Inserted, NewHead, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, StoreError};
 use placeformer::types::{
-    Calibration, ConfidenceCurve, ConfidenceWeights, GLOBAL_DIM, MapName, ModelId, NewReference, Reference,
-    ReferenceId, RerankId,
+    Calibration, ConfidenceCurve, ConfidenceWeights, GLOBAL_DIM, GeoPoint, Heading, MapName, ModelId, NewReference,
+    Reference, ReferenceId, RerankId,
 };
 use places::{MODEL, map, named_reference, reference};
 use std::collections::{BTreeMap, HashSet};
@@ -213,6 +213,22 @@ fn fields_change_and_clear_but_never_take_anothers_external_id() {
         other => panic!("{other:?}"),
     }
     store.verify().unwrap();
+    assert_eq!(store.quarantined().unwrap(), []);
+}
+
+#[test]
+fn numbers_come_back_as_the_bits_their_checksum_covers() {
+    let (_directory, store) = fresh();
+    let city = map("city");
+    let first = create(&store, reference(&city, 1));
+    for (lat, lon, heading) in [(-0.0, 0.0, -0.0), (0.0, -0.0, 360.0), (-90.0, 180.0, -1e-300), (5e-324, 1e-10, 359.9)]
+    {
+        let location = Some(Some(GeoPoint::new(lat, lon).unwrap()));
+        let patch =
+            ReferencePatch { location, heading: Some(Some(Heading::new(heading).unwrap())), ..Default::default() };
+        let changed = store.update(first.id, patch).unwrap();
+        assert_eq!(store.get(first.id).unwrap(), changed, "{lat} {lon} {heading}");
+    }
     assert_eq!(store.quarantined().unwrap(), []);
 }
 

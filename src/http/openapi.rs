@@ -163,7 +163,9 @@ fn add_examples(operation: &mut Value) {
     let id = operation["operationId"].as_str().unwrap_or_default().to_owned();
     for (status, response) in operation["responses"].as_object_mut().into_iter().flatten() {
         let example = if status == "503" { Some(examples::not_ready()) } else { examples::answer(&id) };
-        for (_, content) in response["content"].as_object_mut().into_iter().flatten() {
+        // Indexing would add the key to answers without a body.
+        let contents = response.get_mut("content").and_then(Value::as_object_mut);
+        for (_, content) in contents.into_iter().flatten() {
             content["example"] = example.clone().unwrap_or_default();
         }
     }

@@ -38,7 +38,8 @@ impl GeoPoint {
         if !(-180.0..=180.0).contains(&lon) {
             return Err(InvalidValue::new("lon", format!("{lon} is outside -180 to 180 degrees")));
         }
-        Ok(Self { lat, lon })
+        // Minus zero is the same place, but not the same bits, and a database may keep it as zero.
+        Ok(Self { lat: lat + 0.0, lon: lon + 0.0 })
     }
 
     /// Latitude in degrees.
@@ -99,7 +100,7 @@ impl Heading {
         }
         let folded = degrees.rem_euclid(360.0);
         // A tiny negative angle rounds up to 360 itself.
-        Ok(Self(if folded >= 360.0 { 0.0 } else { folded }))
+        Ok(Self(if folded >= 360.0 { 0.0 } else { folded + 0.0 }))
     }
 
     /// Degrees clockwise from north.
@@ -124,6 +125,13 @@ impl From<Heading> for f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn there_is_no_minus_zero() {
+        let point = GeoPoint::new(-0.0, -0.0).unwrap();
+        let heading = Heading::new(-0.0).unwrap();
+        assert!([point.lat(), point.lon(), heading.degrees()].iter().all(|value| value.is_sign_positive()));
+    }
 
     #[test]
     fn positions_out_of_range_or_not_finite_are_refused() {
