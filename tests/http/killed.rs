@@ -152,8 +152,13 @@ fn a_hundred_kills_lose_nothing_that_was_acknowledged() {
         // Every third round dies at a named write point, the others at a random moment.
         let point = WRITE_POINTS[random.random_range(0..WRITE_POINTS.len())];
         let point = (round % 3 == 0).then(|| format!("{point}:{}", random.random_range(1..12)));
-        let server = Server::start(directory.path(), point);
+        let mut server = Server::start(directory.path(), None);
         check(&server, &told, &recent, round);
+        if point.is_some() {
+            // Checked by a server without the point, because going on with what was interrupted may reach it, too.
+            server.kill();
+            server = Server::start(directory.path(), point);
+        }
         let this_round = std::thread::scope(|scope| {
             let (server, next_seed) = (&server, &next_seed);
             let mut clients: Vec<_> =

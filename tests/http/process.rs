@@ -8,11 +8,14 @@ use placeformer::ops::{LogConfig, LogFormat, logging};
 use placeformer::store::{SqliteStore, StoreConfig, crash_points};
 use serde_json::Value;
 use std::io::{BufRead, BufReader, Read, Write};
+use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
-use std::process::{Child, ChildStdout, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+/// What a crash point raises.
+const SIGABRT: i32 = 6;
 const DIRECTORY: &str = "PLACEFORMER_TEST_SERVED";
 /// Set: the server logs JSON.
 const LOGGED: &str = "PLACEFORMER_TEST_LOGGED";
@@ -64,10 +67,14 @@ impl Server {
     /// Starts it on what is in `directory` and waits until it is ready.
     #[track_caller]
     pub fn start(directory: &Path, crash_point: Option<String>) -> Self {
+        let Some(point) = crash_point else { return Self::start_with(directory, |_| {}).unwrap() };
+        // Starting goes on with what an earlier death interrupted, so the point may be reached before it is ready.
         Self::start_with(directory, |command| {
-            if let Some(point) = crash_point {
-                command.env(crash_points::VARIABLE, point);
-            }
+            command.env(crash_points::VARIABLE, point);
+        })
+        .unwrap_or_else(|died| {
+            assert_eq!(died.signal(), Some(SIGABRT), "the server died of something else while it started: {died}");
+            Self::start_with(directory, |_| {}).unwrap()
         })
     }
 
@@ -78,10 +85,12 @@ impl Server {
         Self::start_with(directory, |command| {
             command.env(LOGGED, "1").stderr(log);
         })
+        .unwrap()
     }
 
+    /// A server that is ready, or how it died before it was.
     #[track_caller]
-    fn start_with(directory: &Path, change: impl FnOnce(&mut Command)) -> Self {
+    fn start_with(directory: &Path, change: impl FnOnce(&mut Command)) -> Result<Self, ExitStatus> {
         let mut command = Command::new(std::env::current_exe().unwrap());
         command
             .args(["--exact", "process::child_that_serves_until_it_is_killed", "--nocapture"])
@@ -100,10 +109,13 @@ impl Server {
             Self { child: Mutex::new(child), _output: output, url: url.expect("the server did not start"), http };
         let began = Instant::now();
         while server.get("/readyz").is_none_or(|(status, _)| status != 200) {
+            if let Some(died) = server.child.lock().unwrap().try_wait().unwrap() {
+                return Err(died);
+            }
             assert!(began.elapsed() < Duration::from_secs(60), "the server never became ready");
             std::thread::sleep(Duration::from_millis(2));
         }
-        server
+        Ok(server)
     }
 
     /// Status and body; `None` if the server died over it.
