@@ -82,7 +82,7 @@ simd: model ## The comparisons with stored outputs, at every level of SIMD
 .PHONY: doc
 doc: ## Examples in the documentation, and its links
 	cargo test --locked --doc
-	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --quiet
+	RUSTDOCFLAGS="-D warnings -A rustdoc::private_intra_doc_links" cargo doc --locked --no-deps --document-private-items --quiet
 
 .PHONY: model
 model: ## Obtain the model's weights

@@ -1,6 +1,6 @@
 //! Every failure as RFC 9457 `application/problem+json`, from the one error table.
 //!
-//! Handlers return [`ApiError`]; its response carries the [`Problem`] as an extension and no body. The outermost
+//! Handlers return [`ApiError`]; its response carries the error itself as an extension and no body. The outermost
 //! layer writes the body, because only it knows the request's id; it also turns whatever else answers with an error
 //! status (the router's 404 and 405, a panic) into the same shape.
 
