@@ -109,7 +109,6 @@ fuzz: .venv/tools ## Each fuzz target for FUZZ_SECONDS (60)
 # compiler carries the sanitizer but needs to be told that it may be used.
 .PHONY: valgrind
 valgrind: ## The kernels' tests under valgrind (needs it installed)
-	cargo test --locked --lib --no-run
 	PROPTEST_CASES=4 valgrind --quiet --error-exitcode=1 \
 	  $$(cargo test --locked --lib --no-run --message-format json | \
 	     $(PYTHON) -c 'import json,sys; print([m["executable"] for m in map(json.loads, sys.stdin) if m.get("executable")][-1])') \
