@@ -33,7 +33,7 @@ use crate::types::{ImageTensor, InvalidValue};
 use chunk::{Chunk, ChunkPlan, HIDDEN_SLICE, Scratch};
 use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
-use weights::{LayerFormats, PackedBlock, PackedLinear};
+use weights::{PackedBlock, PackedLinear};
 
 /// Buffers of one call, for all images of a batch.
 #[derive(Default)]
@@ -278,7 +278,7 @@ impl FusedEncoder {
 
 /// Formats of all products.
 struct Formats {
-    layers: LayerFormats,
+    layers: Format,
     scores: Format,
     mix: Format,
 }
@@ -292,19 +292,15 @@ fn choose_formats(simd: Simd, precision: Precision) -> Result<(Precision, Format
     let (int8, bf16) = (Format::Int8.is_available(simd), Format::Bf16.is_available(simd));
     match precision {
         Precision::Auto => choose_formats(simd, if simd.has_bf16_dot() { Precision::Bf16 } else { Precision::F32 }),
-        Precision::F32 => {
-            Ok((precision, Formats { layers: LayerFormats::all(Format::F32), scores: Format::F32, mix: Format::F32 }))
-        }
+        Precision::F32 => Ok((precision, Formats { layers: Format::F32, scores: Format::F32, mix: Format::F32 })),
         Precision::Bf16 if bf16 => {
             // Scores are exponents: rounded to eight bits, the largest of them lose more than all else together.
-            let layers = LayerFormats::all(Format::Bf16);
-            Ok((precision, Formats { layers, scores: Format::F32, mix: Format::Bf16 }))
+            Ok((precision, Formats { layers: Format::Bf16, scores: Format::F32, mix: Format::Bf16 }))
         }
         Precision::Bf16 => lacks("AVX-512 BF16"),
-        Precision::Int8 if int8 && bf16 => Ok((
-            precision,
-            Formats { layers: LayerFormats::all(Format::Int8), scores: Format::Bf16, mix: Format::Bf16 },
-        )),
+        Precision::Int8 if int8 && bf16 => {
+            Ok((precision, Formats { layers: Format::Int8, scores: Format::Bf16, mix: Format::Bf16 }))
+        }
         Precision::Int8 => lacks("AVX-512 VNNI and BF16"),
     }
 }

@@ -68,26 +68,10 @@ pub(super) struct PackedBlock {
     pub fc2: PackedLinear,
 }
 
-/// Formats of a block's linear layers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct LayerFormats {
-    pub qkv: Format,
-    pub proj: Format,
-    pub fc1: Format,
-    pub fc2: Format,
-}
-
-impl LayerFormats {
-    /// The same for all.
-    pub const fn all(format: Format) -> Self {
-        Self { qkv: format, proj: format, fc1: format, fc2: format }
-    }
-}
-
 impl PackedBlock {
     /// Packs a block whose hidden layer is computed `hidden_slice` numbers at a time.
     pub fn pack(
-        (simd, formats): (Simd, LayerFormats),
+        kernels: (Simd, Format),
         block: &BlockWeights,
         dim: usize,
         head_dim: usize,
@@ -98,16 +82,10 @@ impl PackedBlock {
         let query = |o: usize| if o < dim { query_scale } else { 1.0 };
         let whole = usize::MAX;
         Self {
-            qkv: PackedLinear::pack((simd, formats.qkv), &block.qkv, whole, query, Some(&block.norm1)),
-            proj: PackedLinear::pack((simd, formats.proj), &block.proj, whole, |o| scale(&block.layer_scale1, o), None),
-            fc1: PackedLinear::pack((simd, formats.fc1), &block.fc1, whole, |_| 1.0, Some(&block.norm2)),
-            fc2: PackedLinear::pack(
-                (simd, formats.fc2),
-                &block.fc2,
-                hidden_slice,
-                |o| scale(&block.layer_scale2, o),
-                None,
-            ),
+            qkv: PackedLinear::pack(kernels, &block.qkv, whole, query, Some(&block.norm1)),
+            proj: PackedLinear::pack(kernels, &block.proj, whole, |o| scale(&block.layer_scale1, o), None),
+            fc1: PackedLinear::pack(kernels, &block.fc1, whole, |_| 1.0, Some(&block.norm2)),
+            fc2: PackedLinear::pack(kernels, &block.fc2, hidden_slice, |o| scale(&block.layer_scale2, o), None),
         }
     }
 
