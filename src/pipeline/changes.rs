@@ -1,6 +1,5 @@
 //! Changing and deleting references and maps, in the store and in the index together.
 
-use super::blocking::blocking;
 use super::maps::Change;
 use super::{PipelineError, Service};
 use crate::store::{ReferencePatch, StoreError};
@@ -93,14 +92,6 @@ impl Service {
         self: &Arc<Self>,
         work: impl FnOnce(&Self) -> Result<T, PipelineError> + Send + 'static,
     ) -> Result<T, PipelineError> {
-        let place = self.store_writes.take(self.patience()).await?;
-        let service = self.clone();
-        let outcome = blocking(move || {
-            let outcome = work(&service);
-            service.follow_damage();
-            drop(place);
-            outcome
-        });
-        outcome.await.map_err(|_| PipelineError::Panicked { stage: "the store" })?
+        self.in_turn(&self.store_writes, work).await
     }
 }

@@ -179,15 +179,25 @@ impl Service {
         self: &Arc<Self>,
         work: impl FnOnce(&dyn PlaceStore) -> Result<T, StoreError> + Send + 'static,
     ) -> Result<T, PipelineError> {
-        let place = self.store_reads.take(self.patience()).await?;
+        self.in_turn(&self.store_reads, |service| Ok(work(&*service.store)?)).await
+    }
+
+    /// Runs `work` when its turn has come, and follows what damage it met.
+    ///
+    /// Cancel safety: dropped while waiting, nothing is done; dropped later, the work runs to its end in its place.
+    pub(super) async fn in_turn<T: Send + 'static>(
+        self: &Arc<Self>,
+        turns: &Turns,
+        work: impl FnOnce(&Self) -> Result<T, PipelineError> + Send + 'static,
+    ) -> Result<T, PipelineError> {
+        let place = turns.take(self.patience()).await?;
         let service = self.clone();
         let outcome = blocking(move || {
-            let outcome = work(&*service.store);
+            let outcome = work(&service);
             service.follow_damage();
             drop(place);
             outcome
-        })
-        .await;
-        Ok(outcome.map_err(|_| PipelineError::Panicked { stage: "the store" })??)
+        });
+        outcome.await.map_err(|_| PipelineError::Panicked { stage: "the store" })?
     }
 }
