@@ -8,7 +8,7 @@ use super::maps::{LiveMap, MapEntry, Projection};
 use super::startup::index_entry;
 use super::{PipelineError, Service};
 use crate::extract::{ExtractError, Head};
-use crate::search::{IndexEntry, MapIndex};
+use crate::search::{IndexBuilder, MapIndex};
 use crate::store::{GlobalRow, HeadExchange, MapInfo, NewHead, StoreError};
 use crate::types::{MapName, ModelId};
 use bytes::Bytes;
@@ -77,10 +77,11 @@ impl Service {
         file: Option<&[u8]>,
     ) -> Result<(), PipelineError> {
         let new = NewHead { model: model.clone(), file: file.map(<[u8]>::to_vec) };
-        let mut exchange = Exchange { entry, head: head.clone(), entries: Vec::new(), index: None, changing: None };
+        let mut exchange =
+            Exchange { entry, head: head.clone(), entries: IndexBuilder::default(), index: None, changing: None };
         self.store.replace_globals(name, new, &mut exchange)?;
         let Exchange { index, entries, changing, .. } = exchange;
-        let index = index.unwrap_or_else(|| MapIndex::build(entries));
+        let index = index.unwrap_or_else(|| entries.finish());
         journal.end().into_iter().for_each(|change| change.apply(&index));
         tracing::info!(map = %name, references = index.len(), %model, "the map has another head");
         let projection = if file.is_some() { Projection::Own(head) } else { Projection::Server };
@@ -114,7 +115,7 @@ impl Drop for Journal<'_> {
 struct Exchange<'a> {
     entry: &'a MapEntry,
     head: Arc<Head>,
-    entries: Vec<IndexEntry>,
+    entries: IndexBuilder,
     /// There once the bulk is converted.
     index: Option<MapIndex>,
     changing: Option<RwLockWriteGuard<'a, ()>>,
@@ -133,7 +134,7 @@ impl HeadExchange for Exchange<'_> {
     }
 
     fn finishing(&mut self) {
-        self.index = Some(MapIndex::build(std::mem::take(&mut self.entries)));
+        self.index = Some(std::mem::take(&mut self.entries).finish());
         self.changing = Some(self.entry.changing());
     }
 }
