@@ -1,6 +1,6 @@
 //! `POST /query` through a server of this process, over loopback.
 
-use super::peers::{PeerRow, Peers};
+use super::peers::{Measured, Peers};
 use crate::bench::filled::FilledStore;
 use crate::bench::{fill_with_streets, scenes::street, street_map};
 use crate::cli::serve::{Loaders, run_server};
@@ -42,18 +42,11 @@ pub(super) struct EndToEndRow {
     pub(super) references: u64,
     /// Clients that ask one query after the other.
     pub(super) clients: usize,
-    /// Answers received.
-    pub(super) queries: u64,
-    pub(super) p50_ms: f64,
-    pub(super) p99_ms: f64,
-    pub(super) queries_per_second: f64,
-    /// Median of each stage as the answers tell it.
-    pub(super) stages_ms: BTreeMap<String, f64>,
-    /// Resident memory of server and clients together at the end.
-    pub(super) resident_bytes: u64,
+    #[serde(flatten)]
+    pub(super) ours: Measured,
     /// What users assemble today, with one client and no HTTP between.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) peer: Option<PeerRow>,
+    pub(super) peer: Option<Measured>,
 }
 
 impl EndToEnd<'_> {
@@ -163,17 +156,15 @@ impl Asked {
 
     fn row(&self, references: u64, clients: usize, seconds: f64) -> EndToEndRow {
         let at = |histogram: &Histogram<u64>, quantile| histogram.value_at_quantile(quantile) as f64 / 1e3;
-        EndToEndRow {
-            references,
-            clients,
+        let ours = Measured {
             queries: self.latency.len(),
             p50_ms: at(&self.latency, 0.5),
             p99_ms: at(&self.latency, 0.99),
             queries_per_second: self.latency.len() as f64 / seconds,
             stages_ms: self.stages.iter().map(|(stage, times)| (stage.clone(), at(times, 0.5))).collect(),
             resident_bytes: resident_bytes().unwrap_or_default(),
-            peer: None,
-        }
+        };
+        EndToEndRow { references, clients, ours, peer: None }
     }
 }
 

@@ -12,9 +12,9 @@ use std::process::{Command, Stdio};
 /// The script, from the project's folder.
 const SCRIPT: &str = "benches/peers/pipeline.py";
 
-/// What the script tells of one measurement with one client.
+/// What one measurement gives, ours or the script's.
 #[derive(Debug, Serialize, Deserialize)]
-pub(super) struct PeerRow {
+pub(super) struct Measured {
     /// Answers.
     pub(super) queries: u64,
     pub(super) p50_ms: f64,
@@ -22,7 +22,7 @@ pub(super) struct PeerRow {
     pub(super) queries_per_second: f64,
     /// Median of each stage.
     pub(super) stages_ms: BTreeMap<String, f64>,
-    /// Highest resident memory.
+    /// Resident memory: ours of server and clients together at the end, the script's at its highest.
     pub(super) resident_bytes: u64,
 }
 
@@ -63,7 +63,7 @@ impl<'a> Peers<'a> {
     }
 
     /// Runs the script for `seconds` at a map of `references`.
-    pub(super) fn measure(&self, references: u64, seconds: f64) -> anyhow::Result<PeerRow> {
+    pub(super) fn measure(&self, references: u64, seconds: f64) -> anyhow::Result<Measured> {
         let output = Command::new(self.python)
             .arg(SCRIPT)
             .args(["--weights".as_ref(), self.weights.as_os_str()])

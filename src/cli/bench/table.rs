@@ -1,5 +1,6 @@
 //! Results as text.
 
+use super::peers::Measured;
 use super::{EndToEndRow, Report};
 use crate::bench::Row;
 use std::fmt::Write;
@@ -43,35 +44,24 @@ pub(super) fn end_to_end(rows: &[EndToEndRow]) -> String {
         "references", "clients", "queries", "p50 ms", "p99 ms", "q/s"
     );
     for row in rows {
-        let stages: Vec<String> = row.stages_ms.iter().map(|(stage, ms)| format!("{stage} {ms:.1}")).collect();
-        let _ = writeln!(
-            text,
-            "{:>10} {:>7} {:>8} {:>9.1} {:>9.1} {:>8.2}  {}; {} MiB resident",
-            row.references,
-            row.clients,
-            row.queries,
-            row.p50_ms,
-            row.p99_ms,
-            row.queries_per_second,
-            stages.join(", "),
-            row.resident_bytes >> 20,
-        );
+        let _ = writeln!(text, "{:>10} {:>7} {}", row.references, row.clients, measured(&row.ours));
         if let Some(peer) = &row.peer {
-            let stages: Vec<String> = peer.stages_ms.iter().map(|(stage, ms)| format!("{stage} {ms:.1}")).collect();
-            let _ = writeln!(
-                text,
-                "{:>10} {:>7} {:>8} {:>9.1} {:>9.1} {:>8.2}  {}; {} MiB resident ({:.1} times ours)",
-                "peers",
-                1,
-                peer.queries,
-                peer.p50_ms,
-                peer.p99_ms,
-                peer.queries_per_second,
-                stages.join(", "),
-                peer.resident_bytes >> 20,
-                peer.p50_ms / row.p50_ms,
-            );
+            let times = peer.p50_ms / row.ours.p50_ms;
+            let _ = writeln!(text, "{:>10} {:>7} {} ({times:.1} times ours)", "peers", 1, measured(peer));
         }
     }
     text
+}
+
+fn measured(of: &Measured) -> String {
+    let stages: Vec<String> = of.stages_ms.iter().map(|(stage, ms)| format!("{stage} {ms:.1}")).collect();
+    format!(
+        "{:>8} {:>9.1} {:>9.1} {:>8.2}  {}; {} MiB resident",
+        of.queries,
+        of.p50_ms,
+        of.p99_ms,
+        of.queries_per_second,
+        stages.join(", "),
+        of.resident_bytes >> 20,
+    )
 }
