@@ -13,10 +13,12 @@ mod draw;
 #[cfg(target_arch = "x86_64")]
 mod vector;
 
+#[cfg(target_arch = "x86_64")]
+use super::lanes::{Avx2, Avx512};
 use super::simd::{Simd, SimdLevel};
 pub use draw::{MOST_POSITIONS, Sampler};
 #[cfg(target_arch = "x86_64")]
-use vector::{Avx2, Avx512, Vector};
+use vector::Vector;
 
 /// Most samples screened at once, and solved at once.
 pub const LANES: usize = 16;

@@ -200,7 +200,7 @@ impl Lanes for Portable {
 /// Eight floats in an AVX register.
 #[cfg(target_arch = "x86_64")]
 #[derive(Clone, Copy)]
-pub(super) struct Avx2(__m256);
+pub(super) struct Avx2(pub(super) __m256);
 
 // SAFETY (every block): the trait's contract is that AVX2 and FMA are available and pointers are valid.
 #[cfg(target_arch = "x86_64")]
@@ -282,7 +282,7 @@ impl Lanes for Avx2 {
 /// Sixteen floats in an AVX-512 register.
 #[cfg(target_arch = "x86_64")]
 #[derive(Clone, Copy)]
-pub(super) struct Avx512(__m512);
+pub(super) struct Avx512(pub(super) __m512);
 
 // SAFETY (every block): the trait's contract is that AVX-512F is available and pointers are valid.
 #[cfg(target_arch = "x86_64")]

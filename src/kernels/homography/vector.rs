@@ -1,26 +1,16 @@
-//! A vector of f32 as the kernels of homographies need it, at each level beyond the portable one.
+//! What the kernels of homographies need of a vector of f32 beyond [`Lanes`], at each level beyond the portable one.
 
 use super::Sample;
+use crate::kernels::lanes::{Avx2, Avx512, Lanes};
 use std::arch::x86_64::*;
 
-/// A vector of f32, and masks of one bit per element.
+/// Division, bits, and masks of one bit per element.
 ///
 /// # Safety
 /// Every method may be called only where the level's instructions are available; pointers must be valid for `COUNT`
 /// elements.
-pub(super) trait Vector: Copy {
-    /// Elements.
-    const COUNT: usize;
-
-    unsafe fn splat(value: f32) -> Self;
-    unsafe fn load(from: *const f32) -> Self;
-    unsafe fn store(self, to: *mut f32);
-    unsafe fn add(self, other: Self) -> Self;
-    unsafe fn sub(self, other: Self) -> Self;
-    unsafe fn mul(self, other: Self) -> Self;
+pub(super) trait Vector: Lanes {
     unsafe fn div(self, other: Self) -> Self;
-    /// The smaller; where either is NaN, `other`.
-    unsafe fn min(self, other: Self) -> Self;
     unsafe fn abs(self) -> Self;
     unsafe fn xor(self, other: Self) -> Self;
     unsafe fn or(self, other: Self) -> Self;
@@ -47,52 +37,11 @@ macro_rules! pair {
     };
 }
 
-/// Eight floats.
-#[derive(Clone, Copy)]
-pub(super) struct Avx2(__m256);
-
 impl Vector for Avx2 {
-    const COUNT: usize = 8;
-
-    #[inline(always)]
-    unsafe fn splat(value: f32) -> Self {
-        // SAFETY: AVX2 is available.
-        Self(unsafe { _mm256_set1_ps(value) })
-    }
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> Self {
-        // SAFETY: AVX2 is available; the caller vouches for eight elements.
-        Self(unsafe { _mm256_loadu_ps(from) })
-    }
-    #[inline(always)]
-    unsafe fn store(self, to: *mut f32) {
-        // SAFETY: AVX2 is available; the caller vouches for eight elements.
-        unsafe { _mm256_storeu_ps(to, self.0) }
-    }
-    #[inline(always)]
-    unsafe fn add(self, other: Self) -> Self {
-        // SAFETY: AVX2 is available.
-        Self(unsafe { _mm256_add_ps(self.0, other.0) })
-    }
-    #[inline(always)]
-    unsafe fn sub(self, other: Self) -> Self {
-        // SAFETY: AVX2 is available.
-        Self(unsafe { _mm256_sub_ps(self.0, other.0) })
-    }
-    #[inline(always)]
-    unsafe fn mul(self, other: Self) -> Self {
-        // SAFETY: AVX2 is available.
-        Self(unsafe { _mm256_mul_ps(self.0, other.0) })
-    }
     #[inline(always)]
     unsafe fn div(self, other: Self) -> Self {
         // SAFETY: AVX2 is available.
         Self(unsafe { _mm256_div_ps(self.0, other.0) })
-    }
-    #[inline(always)]
-    unsafe fn min(self, other: Self) -> Self {
-        // SAFETY: AVX2 is available.
-        Self(unsafe { _mm256_min_ps(self.0, other.0) })
     }
     #[inline(always)]
     unsafe fn abs(self) -> Self {
@@ -159,52 +108,11 @@ impl Vector for Avx2 {
     }
 }
 
-/// Sixteen floats.
-#[derive(Clone, Copy)]
-pub(super) struct Avx512(__m512);
-
 impl Vector for Avx512 {
-    const COUNT: usize = 16;
-
-    #[inline(always)]
-    unsafe fn splat(value: f32) -> Self {
-        // SAFETY: AVX-512 is available.
-        Self(unsafe { _mm512_set1_ps(value) })
-    }
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> Self {
-        // SAFETY: AVX-512 is available; the caller vouches for sixteen elements.
-        Self(unsafe { _mm512_loadu_ps(from) })
-    }
-    #[inline(always)]
-    unsafe fn store(self, to: *mut f32) {
-        // SAFETY: AVX-512 is available; the caller vouches for sixteen elements.
-        unsafe { _mm512_storeu_ps(to, self.0) }
-    }
-    #[inline(always)]
-    unsafe fn add(self, other: Self) -> Self {
-        // SAFETY: AVX-512 is available.
-        Self(unsafe { _mm512_add_ps(self.0, other.0) })
-    }
-    #[inline(always)]
-    unsafe fn sub(self, other: Self) -> Self {
-        // SAFETY: AVX-512 is available.
-        Self(unsafe { _mm512_sub_ps(self.0, other.0) })
-    }
-    #[inline(always)]
-    unsafe fn mul(self, other: Self) -> Self {
-        // SAFETY: AVX-512 is available.
-        Self(unsafe { _mm512_mul_ps(self.0, other.0) })
-    }
     #[inline(always)]
     unsafe fn div(self, other: Self) -> Self {
         // SAFETY: AVX-512 is available.
         Self(unsafe { _mm512_div_ps(self.0, other.0) })
-    }
-    #[inline(always)]
-    unsafe fn min(self, other: Self) -> Self {
-        // SAFETY: AVX-512 is available.
-        Self(unsafe { _mm512_min_ps(self.0, other.0) })
     }
     #[inline(always)]
     unsafe fn abs(self) -> Self {
