@@ -48,7 +48,13 @@ impl Service {
     }
 
     fn delete_now(&self, id: ReferenceId) -> Result<Reference, PipelineError> {
-        let entry = self.maps.entry(&self.store.get(id)?.map);
+        let found = self.store.get(id);
+        if let Err(StoreError::Corrupt { .. }) = found {
+            // It cannot say which map it is of; following the damage takes it out of the index.
+            self.follow_damage();
+            return Ok(self.store.delete(id)?);
+        }
+        let entry = self.maps.entry(&found?.map);
         let _changing = entry.changing();
         let reference = self.store.delete(id)?;
         if let Some(live) = entry.live() {
@@ -73,8 +79,7 @@ impl Service {
     }
 
     fn set_calibration_now(&self, name: &MapName, calibration: Option<Calibration>) -> Result<(), PipelineError> {
-        let entry = self.maps.live(name).map(|_| self.maps.entry(name));
-        let entry = entry.ok_or_else(|| PipelineError::MapNotFound(name.clone()))?;
+        let (entry, _) = self.existing(name)?;
         let _changing = entry.changing();
         calibration.iter().try_for_each(|calibration| self.trust.check(name, calibration))?;
         self.store.set_calibration(name, calibration.clone())?;

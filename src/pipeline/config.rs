@@ -11,8 +11,8 @@ pub struct PipelineConfig {
     pub queue_capacity: usize,
     /// Longest time a query may wait for its turn, in milliseconds; one that would wait longer is told at once.
     pub max_wait_ms: u64,
-    /// Listings and look-ups that read the store at once. Fewer than `store.readers`, so that queries always find a
-    /// connection; one that gets no turn within `max_wait_ms` is told to come back later.
+    /// Listings and look-ups that read the store at once. At least two fewer than `store.readers`, so that queries
+    /// always find a connection; one that gets no turn within `max_wait_ms` is told to come back later.
     pub store_reads: usize,
     /// Changes and deletions under way at once, with the same wait.
     pub store_writes: usize,

@@ -56,7 +56,12 @@ pub(super) struct LiveMap {
 impl Maps {
     /// The map, if it exists.
     pub(super) fn live(&self, name: &MapName) -> Option<Arc<LiveMap>> {
-        read(&self.0).get(name).and_then(|entry| entry.live())
+        self.get(name)?.live()
+    }
+
+    /// The entry of a name that was used before.
+    pub(super) fn get(&self, name: &MapName) -> Option<Arc<MapEntry>> {
+        read(&self.0).get(name).cloned()
     }
 
     /// The map, which must exist and be comparable with what a server of `model` sees.
@@ -68,10 +73,15 @@ impl Maps {
 
     /// The entry of a name, made on first use.
     pub(super) fn entry(&self, name: &MapName) -> Arc<MapEntry> {
-        if let Some(entry) = read(&self.0).get(name) {
-            return entry.clone();
+        if let Some(entry) = self.get(name) {
+            return entry;
         }
         write(&self.0).entry(name.clone()).or_default().clone()
+    }
+
+    /// Every entry there is.
+    pub(super) fn entries(&self) -> Vec<Arc<MapEntry>> {
+        read(&self.0).values().cloned().collect()
     }
 
     /// All maps that exist.
@@ -104,8 +114,8 @@ impl MapEntry {
         write(&self.live).get_or_insert_with(fresh).clone()
     }
 
-    pub(super) fn put(&self, live: LiveMap) {
-        *write(&self.live) = Some(Arc::new(live));
+    pub(super) fn put(&self, live: LiveMap) -> Arc<LiveMap> {
+        write(&self.live).insert(Arc::new(live)).clone()
     }
 
     pub(super) fn clear(&self) {
@@ -120,7 +130,8 @@ impl MapEntry {
         begins
     }
 
-    /// Notes a change, if anyone wants to know. Called while [`MapEntry::changing`] is held.
+    /// Notes a change, if anyone wants to know: before the index in force is changed, or while [`MapEntry::changing`] is
+    /// held.
     pub(super) fn note(&self, change: Change) {
         if let Some(journal) = lock(&self.journal).as_mut() {
             journal.push(change);

@@ -95,8 +95,11 @@ impl Service {
     async fn stored_patches(self: &Arc<Self>, id: ReferenceId) -> Result<Arc<PackedPatches>, PipelineError> {
         let reference = self.reference(id).await?;
         let map: MapName = reference.map;
-        self.maps.comparable(&map, self.extraction.source().model_id())?;
-        let service = self.clone();
-        self.read(move |store| service.patches.load(store, id)).await
+        self.in_turn(&self.store_reads, move |service| {
+            let (_, live) = service.existing(&map)?;
+            live.check_model(&map, service.extraction.source().model_id())?;
+            Ok(service.patches.load(&*service.store, id)?)
+        })
+        .await
     }
 }

@@ -104,7 +104,9 @@ impl Service {
 
     async fn answer(self: &Arc<Self>, request: QueryRequest) -> Result<QueryAnswer, PipelineError> {
         let plan = match self.plan(&request.map, request.options) {
-            Err(PipelineError::MapNotFound(map)) => return Err(self.why_no_map(map).await),
+            Err(PipelineError::MapNotFound(map)) => {
+                return self.in_turn(&self.store_reads, move |service| Err(service.why_no_map(&map))).await;
+            }
             plan => plan?,
         };
         let patience = plan.deadline.remaining().min(self.patience());
@@ -204,8 +206,9 @@ impl Service {
         timings.record(&self.metrics, Stage::Rerank, wall - loading);
     }
 
-    /// What the store does not serve is not searched again. Nothing but a deletion takes a reference out of the store,
-    /// so one that is in the index and unknown to the store while no deletion is under way was lost.
+    /// What the store does not serve is not searched again. Nothing but a deletion, or sending the image of a damaged
+    /// one again, takes a reference out of the store; both take it out of the index as well, so one that is in the index
+    /// and unknown to the store while no change is under way was lost.
     fn withdraw(&self, plan: &Plan, id: ReferenceId) {
         let entry = self.maps.entry(&plan.name);
         let _settled = entry.changing();

@@ -22,14 +22,13 @@ impl Service {
     /// Cancel safety: dropped before it began, nothing is done; dropped later, the exchange runs to its end.
     pub async fn set_head(self: &Arc<Self>, map: MapName, file: Option<Bytes>) -> Result<MapInfo, PipelineError> {
         self.may_store()?;
-        self.write(move |service| service.set_head_now(&map, file.as_deref())).await
+        self.in_turn(&self.heads, move |service| service.set_head_now(&map, file.as_deref())).await
     }
 
     fn set_head_now(&self, name: &MapName, file: Option<&[u8]>) -> Result<MapInfo, PipelineError> {
-        let not_found = || PipelineError::MapNotFound(name.clone());
-        let entry = self.maps.live(name).map(|_| self.maps.entry(name)).ok_or_else(not_found)?;
+        let (entry, _) = self.existing(name)?;
         let journal = Journal::begin(&entry).ok_or_else(|| StoreError::ReheadInProgress { map: name.clone() })?;
-        let old = entry.live().ok_or_else(not_found)?;
+        let (_, old) = self.existing(name)?;
         let (head, model) = self.fitting_head(name, file, &old.model)?;
         let as_wished = match old.projection {
             Projection::Server => file.is_none(),
@@ -82,10 +81,11 @@ impl Service {
         self.store.replace_globals(name, new, &mut exchange)?;
         let Exchange { index, entries, changing, .. } = exchange;
         let index = index.unwrap_or_else(|| entries.finish());
-        journal.end().into_iter().for_each(|change| change.apply(&index));
-        tracing::info!(map = %name, references = index.len(), %model, "the map has another head");
         let projection = if file.is_some() { Projection::Own(head) } else { Projection::Server };
-        entry.put(LiveMap::new(model, projection, index, None));
+        // In force before it is told what changed: damage that is met meanwhile is either noted or finds it.
+        let live = entry.put(LiveMap::new(model, projection, index, None));
+        journal.end().into_iter().for_each(|change| change.apply(&live.index));
+        tracing::info!(map = %name, references = live.index.len(), model = %live.model, "the map has another head");
         drop(changing);
         Ok(())
     }

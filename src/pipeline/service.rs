@@ -3,11 +3,10 @@
 use super::admission::{Admission, Turns};
 use super::blocking::blocking;
 use super::extraction::Extraction;
-use super::maps::Maps;
+use super::maps::{Change, LiveMap, MapEntry, Maps};
 use super::patches::PatchCache;
 use super::trust::Trust;
 use super::{PipelineConfig, PipelineError};
-use crate::error::ErrorCode;
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::metrics::MemoryComponent;
 use crate::ops::{Health, Metrics};
@@ -35,6 +34,8 @@ pub struct Service {
     pub(super) store_reads: Turns,
     /// Changing the store for anything but a new reference.
     pub(super) store_writes: Turns,
+    /// One, for giving maps other heads, which takes minutes.
+    pub(super) heads: Turns,
     /// Held while the gauges are brought up to date.
     pub(super) observing: Arc<Mutex<()>>,
     pub(super) memory: MemoryWatermark,
@@ -102,13 +103,7 @@ impl Service {
         after: Option<ReferenceId>,
         limit: usize,
     ) -> Result<Page, PipelineError> {
-        self.read(move |store| {
-            if let Some(map) = &map {
-                store.map(map)?;
-            }
-            store.list(map.as_ref(), after, limit)
-        })
-        .await
+        self.read(move |store| store.list(map.as_ref(), after, limit)).await
     }
 
     /// All maps by name.
@@ -156,19 +151,29 @@ impl Service {
         if damage.withdrawn.is_empty() {
             return;
         }
-        for (_, live) in self.maps.all() {
+        for entry in self.maps.entries() {
             for &id in &damage.withdrawn {
-                live.index.remove(id);
+                // Noted first: a new index is either in force already or still to be told.
+                entry.note(Change::Deleted(id));
+                if let Some(live) = entry.live() {
+                    live.index.remove(id);
+                }
             }
         }
         damage.withdrawn.iter().for_each(|&id| self.patches.forget(id));
     }
 
-    /// A map that cannot be searched does not exist, or its record is damaged.
-    pub(super) async fn why_no_map(self: &Arc<Self>, name: MapName) -> PipelineError {
-        match self.map(name.clone()).await {
-            Err(error) if error.code() == ErrorCode::CorruptRecord => error,
-            _ => PipelineError::MapNotFound(name),
+    /// A map that lives.
+    pub(super) fn existing(&self, name: &MapName) -> Result<(Arc<MapEntry>, Arc<LiveMap>), PipelineError> {
+        let found = self.maps.get(name).and_then(|entry| Some((entry.clone(), entry.live()?)));
+        found.ok_or_else(|| self.why_no_map(name))
+    }
+
+    /// A map that does not live does not exist, or its record is damaged. Reads the store.
+    pub(super) fn why_no_map(&self, name: &MapName) -> PipelineError {
+        match self.store.map(name) {
+            Err(error @ StoreError::CorruptMap { .. }) => error.into(),
+            _ => PipelineError::MapNotFound(name.clone()),
         }
     }
 

@@ -60,6 +60,7 @@ impl Service {
             references: Admission::new(parts.pipeline.queue_capacity, parts.metrics.clone()),
             store_reads: Turns::new(parts.pipeline.store_reads, parts.metrics.clone()),
             store_writes: Turns::new(parts.pipeline.store_writes, parts.metrics.clone()),
+            heads: Turns::new(1, parts.metrics.clone()),
             observing: Arc::default(),
             memory: MemoryWatermark::new(parts.pipeline.memory_watermark_bytes),
             config: parts.pipeline,

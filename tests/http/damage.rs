@@ -1,7 +1,7 @@
 //! A damaged database behind a running service: what can be read is answered, the rest is reported.
 
 use crate::support::{App, FakeSource};
-use placeformer::store::{SqliteStore, StoreConfig};
+use placeformer::store::{PlaceStore, SqliteStore, StoreConfig};
 use rand::{RngExt, SeedableRng};
 use rusqlite::Connection;
 use serde_json::Value;
@@ -165,6 +165,27 @@ async fn a_lost_global_vector_is_noticed_at_start_and_healed_by_the_photo() {
     assert_eq!(app.post_png("/query?map=m&top_k=1", 2).await.ok()["results"][0]["external_id"], "2");
     assert_eq!(metric(&app, "placeformer_quarantined_references").await, 0);
     assert_eq!(metric(&app, "placeformer_corrupt_records_total").await, 1, "met once, counted once");
+}
+
+#[tokio::test]
+async fn a_damaged_reference_can_be_deleted() {
+    let directory = Arc::new(tempfile::tempdir().unwrap());
+    let ids = stored(&directory, 3).await;
+    let app = open(&directory);
+    // One is met by the deletion itself, the other was met before.
+    change(directory.path(), "UPDATE reference SET heading = 12.5 WHERE number < 3");
+    app.get(&format!("/references/{}", ids[1])).await.problem("corrupt_record");
+    for id in &ids[..2] {
+        app.delete(&format!("/references/{id}")).await.ok();
+        app.get(&format!("/references/{id}")).await.problem("reference_not_found");
+        app.delete(&format!("/references/{id}")).await.problem("reference_not_found");
+    }
+    assert_eq!(app.post_png("/query?map=m&top_k=5", 0).await.ok()["results"].as_array().map(Vec::len), Some(1));
+    assert_eq!(metric(&app, "placeformer_references{map=\"m\"}").await, 1);
+    assert_eq!(metric(&app, "placeformer_quarantined_references").await, 0);
+    drop(app);
+    let report = SqliteStore::open(directory.path(), &store_config()).unwrap().verify().unwrap();
+    assert!(report.references == 1 && report.damaged.is_empty() && report.engine_errors.is_empty(), "{report:?}");
 }
 
 #[tokio::test]

@@ -112,7 +112,9 @@ impl SqliteStore {
 
     fn noticing<T>(&self, outcome: Result<T, StoreError>) -> Result<T, StoreError> {
         outcome.inspect_err(|error| match error {
-            StoreError::Damaged { .. } | StoreError::CorruptMap { .. } => self.quarantine.met(error.to_string(), None),
+            StoreError::Damaged { .. } | StoreError::CorruptMap { .. } | StoreError::CorruptHead { .. } => {
+                self.quarantine.met(error.to_string(), None);
+            }
             _ => {}
         })
     }
@@ -226,7 +228,7 @@ impl PlaceStore for SqliteStore {
     }
 
     fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError> {
-        self.readers.with(|connection| rehead::read_head(connection, &MapRow::require(connection, map)?))
+        self.reading(|connection| rehead::read_head(connection, &MapRow::require(connection, map)?))
     }
 
     fn set_calibration(&self, map: &MapName, calibration: Option<Calibration>) -> Result<(), StoreError> {

@@ -45,7 +45,7 @@ impl SqliteStore {
         let bytes = file.as_ref().map_or(0, |file| file.len());
         let (begun, bound) = (name.clone(), model.clone());
         let begin = move |connection: &Connection| begin(connection, &begun, &bound, file.as_deref());
-        let (number, version) = self.writer.run(Effect::Grows(bytes), begin)?;
+        let (number, version) = self.writing(Effect::Grows(bytes), begin)?;
         let exchanged = self.convert(&name, number, version, &model, exchange);
         if exchanged.is_err() {
             // Whatever went wrong is what the caller hears; the next start cleans up if this fails as well.
@@ -74,7 +74,7 @@ impl SqliteStore {
                 let (name, model) = (map.clone(), model.clone());
                 let finish = move |connection: &Connection| finish(connection, &name, &model, version, last);
                 // Freeing the old version follows, so finishing may use the reserve.
-                if self.writer.run(Effect::Shrinks, finish)? {
+                if self.writing(Effect::Shrinks, finish)? {
                     return Ok(());
                 }
                 continue;
@@ -103,7 +103,7 @@ impl SqliteStore {
             sources.iter().zip(&globals).map(|(s, global)| (s.number, codec::encode_f32(global))).collect();
         let (name, bytes) = (map.clone(), encoded.len() * GLOBAL_DIM * 4);
         let write = move |connection: &Connection| write_batch(connection, &name, version, &encoded);
-        self.writer.run(Effect::Grows(bytes), write)?;
+        self.writing(Effect::Grows(bytes), write)?;
         for (source, global) in sources.into_iter().zip(globals) {
             if let Some(row) = source.row {
                 exchange.converted(GlobalRow { global, ..row });
