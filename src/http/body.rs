@@ -127,16 +127,15 @@ pub async fn read_json<T: DeserializeOwned>(state: &AppState, request: Request) 
     serde_json::from_value(Value::Object(object)).map_err(json_error)
 }
 
-/// Reads a body that is one file of at most `limit` bytes; they count against the budget until the second value is
-/// dropped.
-pub async fn read_file(state: &AppState, request: Request, limit: usize) -> Result<(Bytes, Held), ApiError> {
+/// Reads a body that is one file of at most `limit` bytes; they count against the budget until they are dropped.
+pub async fn read_file(state: &AppState, request: Request, limit: usize) -> Result<Bytes, ApiError> {
     let kind = media_type(request.headers());
     if kind.as_deref() != Some("application/octet-stream") {
         let detail = format!("content-type {} is not application/octet-stream", kind.as_deref().unwrap_or("(none)"));
         return Err(ApiError::new(ErrorCode::UnsupportedMediaType, detail));
     }
     let Received { bytes, held } = read_bytes(state, request, limit).await?;
-    Ok((bytes.into(), held))
+    Ok(held.keep_one(bytes))
 }
 
 /// Parses the query string; unknown names are refused by the type.

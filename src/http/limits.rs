@@ -131,6 +131,11 @@ impl Held {
         Ok(())
     }
 
+    /// A buffer with this room.
+    pub fn keep_one(self, bytes: Vec<u8>) -> Bytes {
+        Bytes::from_owner(Charged { bytes, _held: Arc::new(self) })
+    }
+
     /// Buffers that share this room until the last of them, and of their clones, is dropped.
     pub fn keep(self, buffers: Vec<Vec<u8>>) -> Vec<Bytes> {
         let held = Arc::new(self);

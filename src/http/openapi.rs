@@ -114,7 +114,7 @@ fn errors_of(path: &str, method: &str) -> Vec<ErrorCode> {
             &[MapNotFound, HeadUnreadable, HeadMismatch, ModelMismatch, CorruptRecord, MemoryPressure, DiskFull],
         ],
         ("/maps/{map}/head", _) => {
-            &[&[MapNotFound, HeadMismatch, ModelMismatch, CorruptRecord, Overloaded, MemoryPressure, DiskFull]]
+            &[&[MapNotFound, HeadMismatch, ModelMismatch, CorruptRecord, MemoryPressure, DiskFull]]
         }
         ("/maps/{map}", _) => &[&[MapNotFound, CorruptRecord]],
         _ => &[],

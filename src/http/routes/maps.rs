@@ -149,7 +149,7 @@ pub async fn rehead(
     request: Request,
 ) -> Result<Json<MapBody>, ApiError> {
     let (service, map) = (state.service()?, parse_name(&map)?);
-    let (file, _held) = read_file(&state, request, MAX_HEAD_BYTES).await?;
+    let file = read_file(&state, request, MAX_HEAD_BYTES).await?;
     Ok(Json(service.set_head(map, Some(file)).await?.into()))
 }
 
