@@ -10,16 +10,13 @@
 use super::Simd;
 use super::elementwise::{exponentiate_row, scale_rows};
 use super::gemm::{Panel, Tiling, multiply_panel};
+use super::greatest_common_divisor;
 use super::operand::{Format, Rows};
 
 /// Tokens of a chunk: whole register tiles and whole key panels.
 pub fn chunk_rows(simd: Simd) -> usize {
     let tile = Tiling::of(simd);
-    let (mut a, mut b) = (tile.rows, tile.columns);
-    while b > 0 {
-        (a, b) = (b, a % b);
-    }
-    let common = tile.rows / a * tile.columns;
+    let common = tile.rows / greatest_common_divisor(tile.rows, tile.columns) * tile.columns;
     common * (48usize.div_ceil(common))
 }
 

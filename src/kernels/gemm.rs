@@ -127,11 +127,6 @@ impl PackedMatrix {
         self.format
     }
 
-    /// Rows, the length of the sums.
-    pub fn k(&self) -> usize {
-        self.k
-    }
-
     /// Columns.
     pub fn n(&self) -> usize {
         self.n

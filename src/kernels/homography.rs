@@ -13,6 +13,7 @@ mod draw;
 #[cfg(target_arch = "x86_64")]
 mod vector;
 
+use super::greatest_common_divisor;
 #[cfg(target_arch = "x86_64")]
 use super::lanes::{Avx2, Avx512};
 use super::simd::{Simd, SimdLevel};
@@ -87,14 +88,7 @@ impl PointPairs {
 
 /// A step through `len` positions that visits each once and never stays near: about the golden section.
 fn spreading_stride(len: usize) -> usize {
-    let coprime = |a: usize| {
-        let (mut a, mut b) = (a, len);
-        while b > 0 {
-            (a, b) = (b, a % b);
-        }
-        a == 1
-    };
-    (1..=len * 5 / 8).rev().find(|&stride| coprime(stride)).unwrap_or(1)
+    (1..=len * 5 / 8).rev().find(|&stride| greatest_common_divisor(stride, len) == 1).unwrap_or(1)
 }
 
 /// Homographies by lane, entry by entry, row-major and up to a positive scale.
@@ -431,12 +425,12 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
         if samples != expected {
             return Err(format!("samples of {n} correspondences"));
         }
-        let (ours, twin) = (proper(simd, &pairs, &samples, 1e-3), proper_scalar(&pairs, &samples, 1e-3));
-        if ours != twin {
-            return Err(format!("which samples of {n} correspondences are proper: {ours:b} instead of {twin:b}"));
+        let (ours, are_proper) = (proper(simd, &pairs, &samples, 1e-3), proper_scalar(&pairs, &samples, 1e-3));
+        if ours != are_proper {
+            return Err(format!("which samples of {n} correspondences are proper: {ours:b} instead of {are_proper:b}"));
         }
         let (ours, twin) = (solve(simd, &pairs, &samples), solve_scalar(&pairs, &samples));
-        for lane in (0..LANES).filter(|lane| proper_scalar(&pairs, &samples, 1e-3) >> lane & 1 == 1) {
+        for lane in (0..LANES).filter(|lane| are_proper >> lane & 1 == 1) {
             if ours.get(lane).map(f32::to_bits) != twin.get(lane).map(f32::to_bits) {
                 return Err(format!("four-point solutions among {n} correspondences"));
             }

@@ -38,6 +38,13 @@ use std::sync::OnceLock;
 
 pub use simd::{Simd, SimdError, SimdLevel};
 
+fn greatest_common_divisor(mut a: usize, mut b: usize) -> usize {
+    while b > 0 {
+        (a, b) = (b, a % b);
+    }
+    a
+}
+
 /// Compares one kernel at one level with its scalar twin on small odd inputs; tells the first difference.
 type Check = fn(Simd) -> Result<(), String>;
 

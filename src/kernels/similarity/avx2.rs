@@ -5,13 +5,13 @@
 
 use super::driver::{self, Level};
 use super::{BlockMaxima, Blocks, Line, PackedColumns, Quantised, SECTIONS, Scratch};
+use crate::kernels::lanes;
 use std::arch::x86_64::*;
 
 /// Columns of a panel: two vectors.
 const PANEL: usize = 16;
 /// Rows of a tile: 6 x 2 accumulators, two column vectors, a row value and a product fill the 16 registers.
 const TILE: usize = 6;
-const LANES: usize = 8;
 
 /// Lays columns out in panels: line `k` holds values `2k` and `2k + 1` of 16 columns.
 pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
@@ -72,10 +72,9 @@ pub(super) fn block_maxima(
 struct Avx2;
 
 impl Level<TILE> for Avx2 {
-    const LANES: usize = LANES;
     type Code = i16;
     type Line = Line<i16, 32>;
-    type Floats = __m256;
+    type Floats = lanes::Avx2;
     type Integers = __m256i;
 
     #[inline(always)]
@@ -129,15 +128,9 @@ impl Level<TILE> for Avx2 {
     }
 
     #[inline(always)]
-    unsafe fn exact(products: __m256i, _: __m256i) -> __m256 {
+    unsafe fn exact(products: __m256i, _: __m256i) -> lanes::Avx2 {
         // SAFETY: the caller vouches for AVX2.
-        unsafe { _mm256_cvtepi32_ps(products) }
-    }
-
-    #[inline(always)]
-    unsafe fn splat(value: f32) -> __m256 {
-        // SAFETY: the caller vouches for AVX2.
-        unsafe { _mm256_set1_ps(value) }
+        lanes::Avx2(unsafe { _mm256_cvtepi32_ps(products) })
     }
 
     #[inline(always)]
@@ -153,27 +146,9 @@ impl Level<TILE> for Avx2 {
     }
 
     #[inline(always)]
-    unsafe fn multiply(a: __m256, b: __m256) -> __m256 {
-        // SAFETY: the caller vouches for AVX2.
-        unsafe { _mm256_mul_ps(a, b) }
-    }
-
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> __m256 {
-        // SAFETY: the caller vouches for AVX2 and eight elements.
-        unsafe { _mm256_loadu_ps(from) }
-    }
-
-    #[inline(always)]
     unsafe fn load_indices(from: *const i32) -> __m256i {
         // SAFETY: the caller vouches for AVX2 and eight elements.
         unsafe { _mm256_loadu_si256(from.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn store(to: *mut f32, values: __m256) {
-        // SAFETY: the caller vouches for AVX2 and eight elements.
-        unsafe { _mm256_storeu_ps(to, values) }
     }
 
     #[inline(always)]
@@ -183,12 +158,12 @@ impl Level<TILE> for Avx2 {
     }
 
     #[inline(always)]
-    unsafe fn challenge(value: &mut __m256, index: &mut __m256i, new_value: __m256, new_index: __m256i) {
+    unsafe fn challenge(value: &mut lanes::Avx2, index: &mut __m256i, new_value: lanes::Avx2, new_index: __m256i) {
         // SAFETY: the caller vouches for AVX2.
         unsafe {
-            let better = _mm256_cmp_ps::<_CMP_GT_OQ>(new_value, *value);
+            let better = _mm256_cmp_ps::<_CMP_GT_OQ>(new_value.0, value.0);
             // Of (new, held) `max` gives the second when the first is NaN.
-            *value = _mm256_max_ps(new_value, *value);
+            value.0 = _mm256_max_ps(new_value.0, value.0);
             *index = _mm256_blendv_epi8(*index, new_index, _mm256_castps_si256(better));
         }
     }

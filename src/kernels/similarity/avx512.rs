@@ -5,6 +5,7 @@
 
 use super::driver::{self, Level};
 use super::{BlockMaxima, Blocks, Line, PackedColumns, Quantised, SECTIONS, Scratch};
+use crate::kernels::lanes;
 use std::arch::x86_64::*;
 
 /// Columns of a panel: two vectors.
@@ -71,10 +72,9 @@ pub(super) fn block_maxima(
 struct Avx512;
 
 impl Level<TILE> for Avx512 {
-    const LANES: usize = LANES;
     type Code = u8;
     type Line = Line<i8, 64>;
-    type Floats = __m512;
+    type Floats = lanes::Avx512;
     type Integers = __m512i;
 
     #[inline(always)]
@@ -129,15 +129,9 @@ impl Level<TILE> for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn exact(products: __m512i, excess: __m512i) -> __m512 {
+    unsafe fn exact(products: __m512i, excess: __m512i) -> lanes::Avx512 {
         // SAFETY: the caller vouches for AVX-512.
-        unsafe { _mm512_cvtepi32_ps(_mm512_sub_epi32(products, excess)) }
-    }
-
-    #[inline(always)]
-    unsafe fn splat(value: f32) -> __m512 {
-        // SAFETY: the caller vouches for AVX-512.
-        unsafe { _mm512_set1_ps(value) }
+        lanes::Avx512(unsafe { _mm512_cvtepi32_ps(_mm512_sub_epi32(products, excess)) })
     }
 
     #[inline(always)]
@@ -156,27 +150,9 @@ impl Level<TILE> for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn multiply(a: __m512, b: __m512) -> __m512 {
-        // SAFETY: the caller vouches for AVX-512.
-        unsafe { _mm512_mul_ps(a, b) }
-    }
-
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> __m512 {
-        // SAFETY: the caller vouches for AVX-512 and sixteen elements.
-        unsafe { _mm512_loadu_ps(from) }
-    }
-
-    #[inline(always)]
     unsafe fn load_indices(from: *const i32) -> __m512i {
         // SAFETY: the caller vouches for AVX-512 and sixteen elements.
         unsafe { _mm512_loadu_si512(from.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn store(to: *mut f32, values: __m512) {
-        // SAFETY: the caller vouches for AVX-512 and sixteen elements.
-        unsafe { _mm512_storeu_ps(to, values) }
     }
 
     #[inline(always)]
@@ -186,11 +162,11 @@ impl Level<TILE> for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn challenge(value: &mut __m512, index: &mut __m512i, new_value: __m512, new_index: __m512i) {
+    unsafe fn challenge(value: &mut lanes::Avx512, index: &mut __m512i, new_value: lanes::Avx512, new_index: __m512i) {
         // SAFETY: the caller vouches for AVX-512.
         unsafe {
-            let better = _mm512_cmp_ps_mask::<_CMP_GT_OQ>(new_value, *value);
-            *value = _mm512_mask_mov_ps(*value, better, new_value);
+            let better = _mm512_cmp_ps_mask::<_CMP_GT_OQ>(new_value.0, value.0);
+            value.0 = _mm512_mask_mov_ps(value.0, better, new_value.0);
             *index = _mm512_mask_mov_epi32(*index, better, new_index);
         }
     }

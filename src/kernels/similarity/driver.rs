@@ -4,22 +4,21 @@
 //! running maxima of its columns stay in registers, those of the rows are kept lane by lane and reduced at the end.
 
 use super::{Best, BlockMaxima, Blocks, PackedColumns, Quantised, SECTIONS, Scratch};
+use crate::kernels::lanes::Lanes;
 use std::ops::Range;
 
 /// What differs between the levels, for tiles of `TILE` rows.
 ///
 /// # Safety
 /// Methods that are `unsafe` may be called only where the level's instructions are available; pointers must be valid
-/// for `LANES` elements.
+/// for a vector's elements.
 pub(super) trait Level<const TILE: usize> {
-    /// Columns per vector.
-    const LANES: usize;
     /// A padded row's element.
     type Code;
     /// Successive values of the columns of a panel, on a cache line.
     type Line;
     /// A vector of f32.
-    type Floats: Copy;
+    type Floats: Lanes;
     /// A vector of i32.
     type Integers: Copy;
 
@@ -40,14 +39,10 @@ pub(super) trait Level<const TILE: usize> {
     unsafe fn products(rows: *const Self::Code, stride: usize, panel: &[Self::Line]) -> [[Self::Integers; 2]; TILE];
     /// Products less their excess.
     unsafe fn exact(products: Self::Integers, excess: Self::Integers) -> Self::Floats;
-    unsafe fn splat(value: f32) -> Self::Floats;
     unsafe fn splat_index(index: i32) -> Self::Integers;
     /// `first`, `first + 1`, ...
     unsafe fn indices_from(first: i32) -> Self::Integers;
-    unsafe fn multiply(a: Self::Floats, b: Self::Floats) -> Self::Floats;
-    unsafe fn load(from: *const f32) -> Self::Floats;
     unsafe fn load_indices(from: *const i32) -> Self::Integers;
-    unsafe fn store(to: *mut f32, values: Self::Floats);
     unsafe fn store_indices(to: *mut i32, indices: Self::Integers);
     /// Lane-wise running maximum with its index; on a tie or NaN what was held stays.
     unsafe fn challenge(
@@ -72,12 +67,12 @@ pub(super) unsafe fn block_maxima<L: Level<TILE>, const TILE: usize>(
 ) {
     // SAFETY: the caller's.
     unsafe { L::pad(rows, scratch) };
-    let width = 2 * L::LANES;
+    let width = 2 * L::Floats::COUNT;
     let depth = L::lines_per_panel(columns.dim);
     let (mut panel_base, mut column_base) = (0, 0);
     for column_section in 0..SECTIONS {
         let count = columns.counts[column_section];
-        scratch.reset_lanes(L::LANES);
+        scratch.reset_lanes(L::Floats::COUNT);
         for panel in 0..count.div_ceil(width) {
             let index = panel_base + panel;
             let view = Panel::<L, TILE> {
@@ -100,7 +95,7 @@ pub(super) unsafe fn block_maxima<L: Level<TILE>, const TILE: usize>(
                 tile_base += tiles;
             }
         }
-        collect_rows::<TILE>(rows, scratch, L::LANES, &mut out.rows[column_section]);
+        collect_rows::<TILE>(rows, scratch, L::Floats::COUNT, &mut out.rows[column_section]);
         panel_base += count.div_ceil(width);
         column_base += count;
     }
@@ -137,34 +132,39 @@ unsafe fn panel_maxima<L: Level<TILE>, const TILE: usize>(
     let padded = tiles.start * TILE..tiles.end * TILE;
     let codes: *const L::Code = L::padded(scratch)[padded.start * stride..padded.end * stride].as_ptr();
     let row_factors = &scratch.factors[padded.clone()];
-    let lanes = padded.start * L::LANES..padded.end * L::LANES;
+    let lanes = padded.start * L::Floats::COUNT..padded.end * L::Floats::COUNT;
     let (lane_values, lane_indices) = (&mut scratch.lane_values[lanes.clone()], &mut scratch.lane_indices[lanes]);
-    assert!(panel.factors.len() == 2 * L::LANES);
+    assert!(panel.factors.len() == 2 * L::Floats::COUNT);
     // SAFETY: the slices above hold `padded.len()` rows of `stride` elements, one factor and LANES lanes each; a tile
     // starts at a row that is a multiple of TILE below that, so its rows lie inside. `factors` holds two vectors. The
     // instructions are the caller's.
     unsafe {
-        let factors = [L::load(panel.factors.as_ptr()), L::load(panel.factors.as_ptr().add(L::LANES))];
+        let factors =
+            [L::Floats::load(panel.factors.as_ptr()), L::Floats::load(panel.factors.as_ptr().add(L::Floats::COUNT))];
         let first_column = panel.first_column as i32;
-        let indices = [L::indices_from(first_column), L::indices_from(first_column + L::LANES as i32)];
-        let mut best =
-            ColumnBests::<L, TILE> { values: [L::splat(f32::NEG_INFINITY); 2], indices: [L::splat_index(-1); 2] };
+        let indices = [L::indices_from(first_column), L::indices_from(first_column + L::Floats::COUNT as i32)];
+        let mut best = ColumnBests::<L, TILE> {
+            values: [L::Floats::splat(f32::NEG_INFINITY); 2],
+            indices: [L::splat_index(-1); 2],
+        };
         for tile in 0..tiles.len() {
             let products = L::products(codes.add(tile * TILE * stride), stride, panel.lines);
             for (r, products) in products.iter().enumerate() {
                 let row = tile * TILE + r;
-                let row_factor = L::splat(*row_factors.get_unchecked(row));
+                let row_factor = L::Floats::splat(*row_factors.get_unchecked(row));
                 let row_index = L::splat_index((first_row + row) as i32);
-                let (values_at, indices_at) =
-                    (lane_values.as_mut_ptr().add(row * L::LANES), lane_indices.as_mut_ptr().add(row * L::LANES));
-                let (mut value, mut index) = (L::load(values_at), L::load_indices(indices_at));
+                let (values_at, indices_at) = (
+                    lane_values.as_mut_ptr().add(row * L::Floats::COUNT),
+                    lane_indices.as_mut_ptr().add(row * L::Floats::COUNT),
+                );
+                let (mut value, mut index) = (L::Floats::load(values_at), L::load_indices(indices_at));
                 for half in 0..2 {
                     let dot = L::exact(products[half], panel.excess[half]);
                     let (best_value, best_index) = (&mut best.values[half], &mut best.indices[half]);
-                    L::challenge(best_value, best_index, L::multiply(dot, row_factor), row_index);
-                    L::challenge(&mut value, &mut index, L::multiply(dot, factors[half]), indices[half]);
+                    L::challenge(best_value, best_index, dot.mul(row_factor), row_index);
+                    L::challenge(&mut value, &mut index, dot.mul(factors[half]), indices[half]);
                 }
-                L::store(values_at, value);
+                value.store(values_at);
                 L::store_indices(indices_at, index);
             }
         }
@@ -181,12 +181,12 @@ impl<L: Level<TILE>, const TILE: usize> ColumnBests<L, TILE> {
     unsafe fn write(&self, bests: &mut [Best]) {
         // Two vectors of the longest kind.
         let (mut values, mut rows) = ([0f32; 32], [0i32; 32]);
-        assert!(2 * L::LANES <= values.len());
+        assert!(2 * L::Floats::COUNT <= values.len());
         for half in 0..2 {
             // SAFETY: both arrays hold two vectors; the rest is the caller's.
             unsafe {
-                L::store(values.as_mut_ptr().add(half * L::LANES), self.values[half]);
-                L::store_indices(rows.as_mut_ptr().add(half * L::LANES), self.indices[half]);
+                self.values[half].store(values.as_mut_ptr().add(half * L::Floats::COUNT));
+                L::store_indices(rows.as_mut_ptr().add(half * L::Floats::COUNT), self.indices[half]);
             }
         }
         for (best, (&value, &row)) in bests.iter_mut().zip(values.iter().zip(&rows)) {
