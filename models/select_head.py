@@ -69,7 +69,7 @@ def lead(best, other, sets):
 def choose(heads, sets):
     """The winner, the one with the highest score, and for each other head the interval of that one's lead."""
     score = {name: mean(results[s].score("global") for s in sets) for name, results in heads.items()}
-    best = max(heads, key=lambda name: (score[name], name))
+    best = min(heads, key=lambda name: (-score[name], name))
     leads = {name: lead(heads[best], heads[name], sets) for name in heads if name != best}
     level = [best] + [name for name, (low, _) in leads.items() if low <= 0]
     size = {name: heads[name][sets[0]].pooled_bytes for name in heads}

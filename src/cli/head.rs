@@ -73,7 +73,7 @@ enum AggregateKind {
 }
 
 /// Images decoded together while the transformer waits, and encoded together while the decoder does.
-pub(super) const BATCH: usize = 16;
+const BATCH: usize = 16;
 /// Images that visual words are learnt from, evenly spread over all, and tokens drawn from each.
 const WORD_IMAGES: usize = 256;
 const WORD_TOKENS: usize = 100;
@@ -187,7 +187,7 @@ impl Reader {
     }
 }
 
-pub(super) fn decode(path: &Path, extractor: &Extractor) -> anyhow::Result<ImageTensor> {
+fn decode(path: &Path, extractor: &Extractor) -> anyhow::Result<ImageTensor> {
     let bytes = std::fs::read(path)?;
     Ok(load_tensor(&bytes, &ImageConfig::default(), extractor.input_size())?)
 }

@@ -7,7 +7,7 @@
 //! can take it: the mean cannot be turned into a VLAD without the image.
 
 use super::error::ExtractError;
-use super::global::{l2_normalise, mean_token};
+use super::global::{l2_normalise, mean_token, squared_distance};
 use super::weights::hex;
 use rand::seq::index;
 use rand::{RngExt, SeedableRng};
@@ -246,10 +246,6 @@ fn unit(token: &[f32]) -> Vec<f32> {
     let mut token = token.to_vec();
     l2_normalise(&mut token);
     token
-}
-
-fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
-    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
 }
 
 #[cfg(test)]

@@ -10,6 +10,11 @@ pub fn mean_token(tokens: &[f32], dim: usize) -> Vec<f32> {
     sums.iter().map(|sum| (sum / count) as f32).collect()
 }
 
+/// Squared Euclidean distance.
+pub fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
+    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
+}
+
 /// Scales to unit length; a zero vector stays zero.
 pub fn l2_normalise(vector: &mut [f32]) {
     let norm = vector.iter().map(|&v| v as f64 * v as f64).sum::<f64>().sqrt();

@@ -38,7 +38,7 @@ pub use error::ExtractError;
 pub use extractor::{Extractor, build_encoder};
 pub use fused::FusedEncoder;
 pub use fusion::{attention_map, average_pool};
-pub use global::{l2_normalise, mean_token};
+pub use global::{l2_normalise, mean_token, squared_distance};
 pub use head::Head;
 pub use pca::{Covariance, half_whitened_head_of_few};
 pub use positions::interpolate as interpolate_positions;

@@ -7,6 +7,7 @@
 
 use super::TrainError;
 use super::triplets::{Side, TripletSet};
+use crate::extract::squared_distance;
 use rand::SeedableRng;
 use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
@@ -21,16 +22,9 @@ pub(super) struct Embeddings {
 }
 
 impl Embeddings {
-    /// Takes the rows, `[images, dim]`, in the order of `images`.
-    pub(super) fn new(dim: usize, rows: Vec<f32>, images: impl IntoIterator<Item = (Side, u32)>) -> Self {
-        let places = images.into_iter().enumerate().map(|(place, image)| (image, place)).collect();
+    /// Takes the rows, `[rows, dim]`, and which of them is an image's.
+    pub(super) fn new(dim: usize, rows: Vec<f32>, places: HashMap<(Side, u32), usize>) -> Self {
         Self { dim, rows, places }
-    }
-
-    /// Gives queries the descriptors of the database images of the same index: those of a drive, whose frames do both.
-    pub(super) fn share_with_queries(&mut self) {
-        let shared: Vec<_> = self.places.iter().map(|(&(_, index), &place)| ((Side::Query, index), place)).collect();
-        self.places.extend(shared);
     }
 
     /// The descriptor of an image.
@@ -88,10 +82,6 @@ pub(super) fn draw_pool(database: usize, most: usize, seed: u64) -> Vec<u32> {
     drawn
 }
 
-pub(super) fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
-    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -106,7 +96,7 @@ mod tests {
     fn embeddings(database: &[f32]) -> Embeddings {
         let rows = std::iter::once(0.0).chain(database.iter().copied()).collect();
         let images = (0..database.len() as u32).map(|index| (Side::Database, index));
-        Embeddings::new(1, rows, std::iter::once((Side::Query, 0)).chain(images))
+        Embeddings::new(1, rows, std::iter::once((Side::Query, 0)).chain(images).zip(0..).collect())
     }
 
     #[test]

@@ -29,7 +29,7 @@ pub fn verdict(outcome: &Outcome) -> String {
     let gain = match outcome.best == outcome.initial {
         true => "validation never improved, so the weights are those it started from".to_owned(),
         false => {
-            format!("validation recall@1 rose from {:.1} to {:.1} percent", outcome.initial.at_1, outcome.best.at_1)
+            format!("validation recall@1 went from {:.1} to {:.1} percent", outcome.initial.at_1, outcome.best.at_1)
         }
     };
     format!("The run {end} after {} steps; {gain}.", outcome.steps)

@@ -6,8 +6,9 @@ use super::checkpoint::Checkpoint;
 use super::config::{TrainConfig, ValidationRecall};
 use super::log::{CycleRecord, TrainLog};
 use super::loss::triplet_margin_loss;
-use super::mining::{Embeddings, draw_pool, hardest_negatives, squared_distance};
+use super::mining::{Embeddings, draw_pool, hardest_negatives};
 use super::triplets::{Side, TripletSet};
+use crate::extract::squared_distance;
 use candle_core::{Tensor, Var};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -236,7 +237,7 @@ impl Cycle<'_> {
     }
 }
 
-/// Descriptors of `images`, outside the graph; each is described once, a drive whose frames both ask and answer too.
+/// Descriptors of `images`, outside the graph; a file is described once, also where it both asks and answers.
 fn embed(
     model: &dyn TripletModel,
     set: &TripletSet,
@@ -244,12 +245,14 @@ fn embed(
     purpose: &'static str,
     progress: &mut dyn FnMut(Progress<'_>),
 ) -> Result<Embeddings, TrainError> {
-    let is_drive = set.queries == set.database;
-    let asked: BTreeSet<(Side, u32)> = images.into_iter().collect();
-    let own = |&(side, index): &(Side, u32)| if is_drive { (Side::Database, index) } else { (side, index) };
-    let distinct: Vec<(Side, u32)> = asked.iter().map(own).collect::<BTreeSet<_>>().into_iter().collect();
-    let samples: Vec<Sample> =
-        distinct.iter().map(|&(side, index)| Sample { side, index: index as usize, variation: None }).collect();
+    let (mut samples, mut places, mut rows_of) = (Vec::new(), HashMap::new(), HashMap::new());
+    for (side, index) in images.into_iter().collect::<BTreeSet<(Side, u32)>>() {
+        let row = *rows_of.entry(&set.images(side)[index as usize]).or_insert_with(|| {
+            samples.push(Sample { side, index: index as usize, variation: None });
+            samples.len() - 1
+        });
+        places.insert((side, index), row);
+    }
     let (mut dim, mut rows, mut done) = (0, Vec::new(), 0);
     for chunk in samples.chunks(model.embed_batch()) {
         let descriptors = model.embed(set, chunk)?.detach();
@@ -258,11 +261,7 @@ fn embed(
         done += chunk.len();
         progress(Progress::Described { purpose, done, of: samples.len() });
     }
-    let mut embeddings = Embeddings::new(dim, rows, distinct);
-    if is_drive {
-        embeddings.share_with_queries();
-    }
-    Ok(embeddings)
+    Ok(Embeddings::new(dim, rows, places))
 }
 
 /// Recall over the usable queries; images that are near without being positives are passed over, as a frame of a

@@ -60,7 +60,7 @@ fn starting_head(args: &RunArgs, extract: &ExtractConfig, training: &TripletSet)
         Some(head) => Ok(head.clone()),
         None => {
             let tokens = Source::open(args, &extractor)?.tokens(training)?;
-            fit(&extractor, &tokens)
+            fit(&extractor, training, &tokens)
         }
     }
 }

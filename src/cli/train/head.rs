@@ -5,6 +5,7 @@ use crate::extract::{Covariance, Extractor, Head, HeadChoice, half_whitened_head
 use crate::train::{Augmentation, HeadModel, PooledCache, PooledTokens, Progress, Session, Side, TripletSet};
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
+use std::collections::HashSet;
 
 /// Runs `head train`.
 pub(in crate::cli) fn train_head(args: HeadTrainArgs) -> anyhow::Result<()> {
@@ -23,13 +24,16 @@ pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
     let validation = source.tokens(&sides.validation)?;
     let start = match extractor.head() {
         Some(head) => head.clone(),
-        None => fit(&extractor, &training)?,
+        None => fit(&extractor, &sides.training, &training)?,
     };
+    drop(source);
     let dim = start.dim();
     let (weight, bias) = start.weights();
     let model = HeadModel::new(weight, bias, training.cache(dim)?, validation.cache(dim)?)?;
     let identity = [
         start.backbone(),
+        // Tokens of another arithmetic are other tokens: the run would not go on bit for bit.
+        &extractor.encoder_name(),
         &extractor.input_size().to_string(),
         &start.content_hash(),
         &sides.training.fingerprint(),
@@ -86,11 +90,16 @@ impl Tokens {
     }
 }
 
-/// The head to start from where none is given: what `head fit` would make of the training images.
-pub(super) fn fit(extractor: &Extractor, training: &Tokens) -> anyhow::Result<Head> {
+/// The head to start from where none is given: what `head fit` would make of the training images, each of which counts
+/// once even if it both asks and answers.
+pub(super) fn fit(extractor: &Extractor, set: &TripletSet, training: &Tokens) -> anyhow::Result<Head> {
     let (aggregate, backbone) = (extractor.aggregate().clone(), extractor.backbone());
     let dim = aggregate.pooled_dim(extractor.dim());
-    let rows = || training.database.chunks_exact(dim).chain(training.queries.chunks_exact(dim));
+    let images = || set.images(Side::Database).iter().chain(set.images(Side::Query));
+    let mut seen = HashSet::new();
+    let is_first: Vec<bool> = images().map(|image| seen.insert(image)).collect();
+    let all = || training.database.chunks_exact(dim).chain(training.queries.chunks_exact(dim));
+    let rows = || all().zip(&is_first).filter(|(_, first)| **first).map(|(row, _)| row);
     if rows().count() <= dim {
         let rows: Vec<Vec<f32>> = rows().map(<[f32]>::to_vec).collect();
         return Ok(half_whitened_head_of_few(&rows, aggregate, backbone, Default::default())?);
