@@ -4,7 +4,7 @@ use super::candidates::dequantised;
 use super::filled::FilledStore;
 use super::limits::Limits;
 use super::measure::{median, paired};
-use super::scenes::{CANDIDATES, DIM, PHOTO_SIZE, RerankScene, index_entry, photo, street, unit_vector};
+use super::scenes::{CANDIDATES, PHOTO_SIZE, RerankScene, index_entry, photo, street, unit_vector};
 use super::{Row, baselines};
 use crate::extract::{
     CandleEncoder, Encoder, EncoderSpec, ExtractError, Extractor, Geometry, Precision, VitWeights, build_encoder,
@@ -121,7 +121,7 @@ pub struct Bench {
     pub spec: EncoderSpec,
     /// The machine's limits.
     pub limits: Limits,
-    /// An empty folder for a store and files.
+    /// A folder for a store and files; streets that an earlier run drew there are used again.
     pub folder: PathBuf,
     /// Paired runs of a row that takes long; short rows take more.
     pub rounds: usize,
@@ -193,7 +193,7 @@ impl Bench {
             .map(|place| load_tensor(&street(place, 0, REFERENCE_SIZE)?, &ImageConfig::default(), self.spec.input_size))
             .collect::<Result<Vec<ImageTensor>, _>>()?;
         let (a, b) = (ours.encode(&images[..1])?, plain.encode(&images[..1])?);
-        let cosine = cosine(&a[0].tokens, &b[0].tokens);
+        let cosine = cosine(&a[0].tokens, &b[0].tokens, self.weights.geometry.dim);
         agree("extract", cosine > 0.995, || format!("the tokens' cosine is {cosine}"))?;
         let (ours_ms, plain_ms) = paired(self.rounds, || ours.encode(&images), || plain.encode(&images));
         let times = (ours_ms / batch as f64, plain_ms / batch as f64);
@@ -347,9 +347,9 @@ pub(super) fn agree(row: &'static str, yes: bool, difference: impl FnOnce() -> S
 }
 
 /// Median cosine of corresponding rows.
-fn cosine(a: &[f32], b: &[f32]) -> f64 {
+fn cosine(a: &[f32], b: &[f32], dim: usize) -> f64 {
     let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
-    let rows = a.chunks_exact(DIM).zip(b.chunks_exact(DIM));
+    let rows = a.chunks_exact(dim).zip(b.chunks_exact(dim));
     median(rows.map(|(a, b)| dot(a, b) / (dot(a, a) * dot(b, b)).sqrt()).collect())
 }
 

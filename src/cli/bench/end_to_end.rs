@@ -105,7 +105,7 @@ impl EndToEnd<'_> {
         for &clients in self.clients {
             println!("{references} references, {clients} clients");
             let asked = ask(&client, &url, photos, clients, Duration::from_secs_f64(self.seconds)).await?;
-            rows.push(asked.row(references, clients, self.seconds));
+            rows.push(asked.row(references, clients));
         }
         // The server may have ended with an error, which the next line tells.
         let _ = stop.send(());
@@ -130,11 +130,13 @@ async fn wait_until_ready(client: &reqwest::Client, url: &str) -> anyhow::Result
 struct Asked {
     latency: Histogram<u64>,
     stages: BTreeMap<String, Histogram<u64>>,
+    /// From the first question to the last answer.
+    elapsed: Duration,
 }
 
 impl Default for Asked {
     fn default() -> Self {
-        Self { latency: histogram(), stages: BTreeMap::new() }
+        Self { latency: histogram(), stages: BTreeMap::new(), elapsed: Duration::ZERO }
     }
 }
 
@@ -154,13 +156,13 @@ impl Asked {
         Ok(())
     }
 
-    fn row(&self, references: u64, clients: usize, seconds: f64) -> EndToEndRow {
+    fn row(&self, references: u64, clients: usize) -> EndToEndRow {
         let at = |histogram: &Histogram<u64>, quantile| histogram.value_at_quantile(quantile) as f64 / 1e3;
         let ours = Measured {
             queries: self.latency.len(),
             p50_ms: at(&self.latency, 0.5),
             p99_ms: at(&self.latency, 0.99),
-            queries_per_second: self.latency.len() as f64 / seconds,
+            queries_per_second: self.latency.len() as f64 / self.elapsed.as_secs_f64(),
             stages_ms: self.stages.iter().map(|(stage, times)| (stage.clone(), at(times, 0.5))).collect(),
             resident_bytes: resident_bytes().unwrap_or_default(),
         };
@@ -181,12 +183,12 @@ async fn ask(
     for photo in photos.iter().take(2) {
         query(client, &url, photo.clone()).await?;
     }
-    let (asked, until) = (Arc::new(Mutex::new(Asked::default())), Instant::now() + time);
+    let (asked, began) = (Arc::new(Mutex::new(Asked::default())), Instant::now());
     let tasks = (0..clients).map(|number| {
         let (client, url, photos, asked) = (client.clone(), url.clone(), Arc::clone(photos), Arc::clone(&asked));
         tokio::spawn(async move {
             for photo in photos.iter().cycle().skip(number * 5) {
-                if Instant::now() >= until {
+                if began.elapsed() >= time {
                     break;
                 }
                 let (latency, timings) = query(&client, &url, photo.clone()).await?;
@@ -198,7 +200,8 @@ async fn ask(
     for task in tasks.collect::<Vec<_>>() {
         task.await??;
     }
-    Ok(std::mem::take(&mut *asked.lock().unwrap_or_else(PoisonError::into_inner)))
+    let asked = std::mem::take(&mut *asked.lock().unwrap_or_else(PoisonError::into_inner));
+    Ok(Asked { elapsed: began.elapsed(), ..asked })
 }
 
 async fn query(

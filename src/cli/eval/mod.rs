@@ -234,6 +234,7 @@ impl DataArgs {
             swap: self.swap,
             ..self.reading.options()
         };
+        options.check()?;
         let dataset = match (&self.database, &self.queries, &self.ground_truth, self.dataset, &self.root) {
             (Some(database), Some(queries), Some(truth), ..) => datasets::load_pairs(database, queries, truth)?,
             (_, _, _, Some(kind), Some(root)) => datasets::load(kind, root, &options)?,

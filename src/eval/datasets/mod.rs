@@ -184,7 +184,7 @@ impl Split {
 /// How a data set is to be read. `None` is the data set's own default.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DatasetOptions {
-    /// Which part; the default is `test`, except RobotCar's `train` (whose poses are public).
+    /// Which part; the default is `test`, except `val` for MSLS and `train` for RobotCar, whose poses there are public.
     pub split: Option<Split>,
     /// Greatest distance of a positive in metres (paper IV: 25).
     pub radius_m: f64,
@@ -215,7 +215,11 @@ impl Default for DatasetOptions {
 }
 
 impl DatasetOptions {
-    fn check(&self) -> Result<(), EvalError> {
+    /// Refuses values out of range.
+    ///
+    /// # Errors
+    /// The radius or the view angle is.
+    pub fn check(&self) -> Result<(), EvalError> {
         if !(self.radius_m.is_finite() && self.radius_m > 0.0) {
             return Err(EvalError::Setting(format!(
                 "the radius must be a positive number of metres, not {}",
