@@ -26,7 +26,7 @@ mod manual;
 /// Prefix of the environment variables.
 const PREFIX: &str = "PLACEFORMER_";
 
-/// Reading connections that listings and look-ups leave alone: one for queries, one for the metrics.
+/// Reading connections that listings and look-ups leave alone: one for queries, one for changes.
 const READERS_KEPT_FREE: usize = 2;
 
 /// Every setting of the service.
@@ -100,7 +100,7 @@ pub struct ModelOverrides {
     /// Projection to the global descriptor: default, or a file.
     #[arg(long, value_name = "HEAD")]
     pub head: Option<HeadChoice>,
-    /// Arithmetic of the transformer: auto (f32), f32, bf16 or int8.
+    /// Arithmetic of the transformer: auto (bf16 where the CPU has it, else f32), f32, bf16 or int8.
     #[arg(long, value_name = "NAME")]
     pub precision: Option<Precision>,
 }

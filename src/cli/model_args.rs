@@ -42,20 +42,12 @@ pub struct ModelOptions {
     #[arg(long, value_parser = parse_stride)]
     pub stride: Option<PoolingStride>,
     /// Arithmetic of the transformer: auto (bf16 where the CPU has it, else f32), f32, bf16 or int8.
-    #[arg(long, value_parser = parse_precision)]
+    #[arg(long, value_name = "NAME")]
     pub precision: Option<Precision>,
 }
 
-fn parse_named<T: serde::de::DeserializeOwned>(text: &str, choices: &str) -> Result<T, String> {
-    serde_json::from_value(serde_json::Value::String(text.to_lowercase())).map_err(|_| format!("use {choices}"))
-}
-
 fn parse_stride(text: &str) -> Result<PoolingStride, String> {
-    parse_named(text, "kernel or one")
-}
-
-fn parse_precision(text: &str) -> Result<Precision, String> {
-    parse_named(text, "auto, f32, bf16 or int8")
+    serde_json::from_value(text.to_lowercase().into()).map_err(|_| "use kernel or one".to_owned())
 }
 
 impl ModelOptions {

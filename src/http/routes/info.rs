@@ -15,7 +15,7 @@ pub struct InfoBody {
     /// Version of the program.
     #[schema(example = "0.1.0")]
     pub version: &'static str,
-    /// The model: maps built with another one cannot be searched here.
+    /// The model: maps of another one can be searched here only if they keep a head of their own for the same backbone.
     pub model: String,
     /// Images are resized to this before anything is computed.
     pub input_size: SizeBody,
