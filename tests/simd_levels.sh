@@ -5,7 +5,7 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bin=${BIN:-target/debug/placeformer}
 ran=0
-for level in scalar avx2 avx512; do
+for level in scalar avx2 avx512 amx; do
     if ! refusal=$(PLACEFORMER_SIMD=$level "$bin" model info 2>&1 >/dev/null); then
         case $refusal in
             *'goes no further than'*) echo "left out on this CPU: $level" && continue ;;

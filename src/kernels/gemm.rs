@@ -19,6 +19,8 @@ use super::lanes::{Avx2, Avx512};
 use super::lanes::{Portable, at_bf16_level, at_level};
 use super::operand::{Format, Rows};
 use super::simd::SimdLevel;
+#[cfg(target_arch = "x86_64")]
+use super::tiles;
 
 /// Sums held in registers at once.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,6 +38,8 @@ impl Tiling {
             SimdLevel::Scalar => Self { rows: 4, columns: 8 },
             SimdLevel::Avx2 => Self { rows: 6, columns: 16 },
             SimdLevel::Avx512 => Self { rows: 12, columns: 32 },
+            // Two matrix registers wide; their height, of which twice as many rows are taken at once where there are.
+            SimdLevel::Amx => Self { rows: 16, columns: 32 },
         }
     }
 }
@@ -225,7 +229,12 @@ pub fn multiply_panel(
         segment_stride: panel.segment_stride,
         out: out.as_mut_ptr().cast(),
         out_stride,
+        adds: false,
     };
+    #[cfg(target_arch = "x86_64")]
+    if simd.level() == SimdLevel::Amx {
+        return job.run_tiles(simd, format);
+    }
     match format {
         Format::F32 => at_level!(
             simd,
@@ -268,9 +277,60 @@ struct TileJob {
     segment_stride: usize,
     out: *mut u32,
     out_stride: usize,
+    /// Whether the sums go on from what `out` holds.
+    adds: bool,
 }
 
 impl TileJob {
+    /// As much of the sums as fills matrix registers there, the rest of k in vectors.
+    #[cfg(target_arch = "x86_64")]
+    fn run_tiles(&self, simd: Simd, format: Format) {
+        let whole = match format {
+            Format::F32 => 0,
+            // A step of the tiles must not reach across the end of a segment.
+            _ if self.k > self.segment_rows && !self.segment_rows.is_multiple_of(tiles::STEP) => 0,
+            _ => self.k / tiles::STEP * tiles::STEP,
+        };
+        if whole > 0 {
+            let job = tiles::TileProduct {
+                rows: self.rows,
+                left: self.left,
+                left_stride: self.left_stride,
+                right: self.right,
+                k: whole,
+                segment_rows: self.segment_rows,
+                segment_stride: self.segment_stride,
+                out: self.out,
+                out_stride: self.out_stride,
+            };
+            // SAFETY: `multiply_panel` has checked the extents, of which this is a part, and that rows are whole tiles;
+            // segments are whole steps.
+            unsafe { job.run(simd, format) };
+        }
+        if whole == self.k {
+            return;
+        }
+        let (segment, within) = (whole / self.segment_rows, whole % self.segment_rows);
+        let columns = Tiling::of(simd).columns;
+        let rest = Self {
+            left: self.left.wrapping_add(whole),
+            right: self.right.wrapping_add(segment * self.segment_stride + within * columns),
+            k: self.k - whole,
+            // What is left after whole steps lies in one segment; nothing is left out where no step was taken.
+            segment_rows: if whole > 0 { self.k - whole } else { self.segment_rows },
+            adds: whole > 0,
+            ..*self
+        };
+        // SAFETY: `multiply_panel` has checked the extents, of which this is the rest; AMX includes these instructions.
+        unsafe {
+            match format {
+                Format::F32 => rest_f32(&rest),
+                Format::Bf16 => rest_bf16(&rest),
+                Format::Int8 => rest_int8(&rest),
+            }
+        }
+    }
+
     #[inline(always)]
     unsafe fn run<D: Dot, const MR: usize, const NV: usize>(&self) {
         for row in (0..self.rows).step_by(MR) {
@@ -291,6 +351,13 @@ impl TileJob {
         // SAFETY: the extents were checked by `multiply_panel`; the level's instructions are available.
         unsafe {
             let mut sums = [[D::zero(); NV]; MR];
+            if self.adds {
+                for row in 0..MR {
+                    for vector in 0..NV {
+                        sums[row][vector] = D::load(out.wrapping_add(row * self.out_stride + vectors[vector]));
+                    }
+                }
+            }
             let (mut segment, mut remaining) = (self.right, self.k);
             while remaining > 0 {
                 let count = remaining.min(self.segment_rows);
@@ -320,6 +387,24 @@ impl TileJob {
         }
     }
 }
+
+/// What tiles leave over, half a tile's height at a time: its sums fill half of the vector registers.
+macro_rules! rest {
+    ($name:ident, $dot:ty, $features:literal) => {
+        /// # Safety
+        /// The CPU has the instructions; the job's extents are checked.
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = $features)]
+        unsafe fn $name(job: &TileJob) {
+            // SAFETY: the caller's.
+            unsafe { job.run::<$dot, 8, 2>() }
+        }
+    };
+}
+
+rest!(rest_f32, Avx512, "avx512f,avx512bw,avx512dq,avx512vl");
+rest!(rest_bf16, Avx512Bf16, "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16");
+rest!(rest_int8, Avx512Int8, "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni");
 
 /// The kernel against a plain sum on small odd sizes, in every format of the level.
 pub(super) fn check(simd: Simd) -> Result<(), String> {
@@ -401,15 +486,17 @@ mod tests {
 
         #[test]
         fn sums_of_integers_equal_the_scalar_twins_bit_for_bit(steps in 1usize..9, seed in 0u32..1000) {
+            // Whole tiles of every level.
+            const ROWS: usize = 48;
             let k = 16 * steps;
-            let (left, right) = (ramp(12 * k, seed), ramp(k * 8, seed + 1));
+            let (left, right) = (ramp(ROWS * k, seed), ramp(k * 8, seed + 1));
             let run = |simd: Simd| {
                 let (tile, mut buffer) = (Tiling::of(simd), OperandBuffer::default());
                 let matrix = PackedMatrix::pack(simd, Format::Int8, (k, 8), k, |row, column| right[row * 8 + column]);
-                let packed = buffer.pack(simd, Format::Int8, 12, k, (&left, k));
-                let mut out = vec![0.0; 12 * tile.columns];
-                multiply_panel(simd, Format::Int8, 12, packed.rows, matrix.panel(0, 0), &mut out, tile.columns);
-                (0..12 * 8).map(|at| out[at / 8 * tile.columns + at % 8].to_bits()).collect::<Vec<_>>()
+                let packed = buffer.pack(simd, Format::Int8, ROWS, k, (&left, k));
+                let mut out = vec![0.0; ROWS * tile.columns];
+                multiply_panel(simd, Format::Int8, ROWS, packed.rows, matrix.panel(0, 0), &mut out, tile.columns);
+                (0..ROWS * 8).map(|at| out[at / 8 * tile.columns + at % 8].to_bits()).collect::<Vec<_>>()
             };
             for simd in Simd::all() {
                 prop_assert_eq!(run(simd), run(Simd::SCALAR));

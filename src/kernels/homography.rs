@@ -124,7 +124,7 @@ pub fn proper(simd: Simd, pairs: &PointPairs, samples: &[Sample; LANES], min_are
         SimdLevel::Avx2 => unsafe { proper_avx2(pairs, samples, min_area) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx512 => unsafe { proper_avx512(pairs, samples, min_area) },
+        SimdLevel::Avx512 | SimdLevel::Amx => unsafe { proper_avx512(pairs, samples, min_area) },
         #[cfg(not(target_arch = "x86_64"))]
         level => unreachable!("a token for {level} cannot exist on this architecture"),
     }
@@ -142,7 +142,7 @@ pub fn solve(simd: Simd, pairs: &PointPairs, samples: &[Sample; LANES]) -> Hypot
         SimdLevel::Avx2 => unsafe { solve_avx2(pairs, samples) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx512 => unsafe { solve_avx512(pairs, samples) },
+        SimdLevel::Avx512 | SimdLevel::Amx => unsafe { solve_avx512(pairs, samples) },
         #[cfg(not(target_arch = "x86_64"))]
         level => unreachable!("a token for {level} cannot exist on this architecture"),
     }
@@ -158,7 +158,7 @@ pub fn count_inliers(simd: Simd, pairs: &PointPairs, homography: &[f32; 9], floo
         SimdLevel::Avx2 => unsafe { count_avx2(pairs, homography, floor) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx512 => unsafe { count_avx512(pairs, homography, floor) },
+        SimdLevel::Avx512 | SimdLevel::Amx => unsafe { count_avx512(pairs, homography, floor) },
         #[cfg(not(target_arch = "x86_64"))]
         level => unreachable!("a token for {level} cannot exist on this architecture"),
     }

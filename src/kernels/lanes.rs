@@ -386,7 +386,7 @@ macro_rules! at_bf16_level {
      $portable:expr, $avx2:expr, $avx512:expr $(,)?) => {{
         let simd: $crate::kernels::Simd = $simd;
         assert!(
-            simd.level() != $crate::kernels::SimdLevel::Avx512 || simd.has_bf16_dot(),
+            simd.level() < $crate::kernels::SimdLevel::Avx512 || simd.has_bf16_dot(),
             "this CPU has no AVX-512 BF16"
         );
         $crate::kernels::lanes::instances!(
@@ -421,7 +421,7 @@ macro_rules! instances {
         match $simd.level() {
             #[cfg(target_arch = "x86_64")]
             // SAFETY: the token proves the level; the surrounding function has checked the arguments.
-            $crate::kernels::SimdLevel::Avx512 => unsafe { avx512($($value),*) },
+            $crate::kernels::SimdLevel::Avx512 | $crate::kernels::SimdLevel::Amx => unsafe { avx512($($value),*) },
             #[cfg(target_arch = "x86_64")]
             // SAFETY: the same.
             $crate::kernels::SimdLevel::Avx2 => unsafe { avx2($($value),*) },

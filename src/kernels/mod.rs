@@ -10,10 +10,10 @@
 //! | [`quantise`] | f32 vectors to int8 codes |
 //! | [`peak`] | what the machine can do at most, for benchmarks |
 //! | [`operand`], `dot` | the formats of a product: f32, bf16, int8 |
-//! | `lanes`, [`aligned`] | a vector register by level; buffers on cache lines |
+//! | `lanes`, `tiles`, [`aligned`] | vector registers by level; matrix registers (AMX); buffers on cache lines |
 //!
 //! Every kernel takes a [`Simd`] and has a portable twin, which tests compare it with over odd sizes. Where tests ran
-//! on a CPU without AVX-512, that level is still guarded: [`self_check`] compares every kernel with its twin on the
+//! on a CPU without AVX-512 or AMX, that level is still guarded: [`self_check`] compares every kernel with its twin on the
 //! machine at hand before the program computes anything, and a level that disagrees is refused with an error.
 
 pub mod aligned;
@@ -33,6 +33,8 @@ pub mod simd;
 #[allow(clippy::needless_range_loop, reason = "sections and halves index several arrays at once")]
 pub mod similarity;
 mod testing;
+#[cfg(target_arch = "x86_64")]
+mod tiles;
 
 use std::sync::OnceLock;
 

@@ -46,7 +46,7 @@ impl Format {
         match self {
             Self::F32 => true,
             Self::Bf16 => simd.level() == SimdLevel::Scalar || simd.has_bf16_dot(),
-            Self::Int8 => matches!(simd.level(), SimdLevel::Scalar | SimdLevel::Avx512),
+            Self::Int8 => simd.level() == SimdLevel::Scalar || simd.level() >= SimdLevel::Avx512,
         }
     }
 }
@@ -85,7 +85,7 @@ pub struct OperandBuffer {
 
 /// Widths that [`OperandBuffer::pack`] takes are multiples of this: a vector's length.
 pub fn width_step(simd: Simd) -> usize {
-    if simd.level() == SimdLevel::Avx512 { 16 } else { 8 }
+    if simd.level() >= SimdLevel::Avx512 { 16 } else { 8 }
 }
 
 impl OperandBuffer {

@@ -7,6 +7,9 @@ use super::Simd;
 #[cfg(target_arch = "x86_64")]
 use super::lanes::{Avx2, Avx512};
 use super::lanes::{Lanes, Portable, at_level};
+use super::simd::SimdLevel;
+#[cfg(target_arch = "x86_64")]
+use super::tiles;
 use std::time::{Duration, Instant};
 
 /// Independent sums: latency 4 times two per cycle, with some to spare, within sixteen registers.
@@ -16,10 +19,7 @@ const ROUNDS: usize = 20_000;
 
 /// Multiply-adds of f32 per second on this thread, each counted as two operations, over at least `time`.
 pub fn f32_operations(simd: Simd, time: Duration) -> f64 {
-    let lanes = match simd.level() {
-        super::SimdLevel::Avx512 => 16,
-        _ => 8,
-    };
+    let lanes = if simd.level() >= SimdLevel::Avx512 { 16 } else { 8 };
     repeated(time, 2 * lanes, || {
         at_level!(
             simd,
@@ -34,6 +34,10 @@ pub fn f32_operations(simd: Simd, time: Duration) -> f64 {
 /// Multiply-adds of bf16 with f32 sums per second on this thread; `None` where the CPU has no such instruction.
 pub fn bf16_operations(simd: Simd, time: Duration) -> Option<f64> {
     #[cfg(target_arch = "x86_64")]
+    if simd.level() == SimdLevel::Amx {
+        return Some(repeated(time, tiles::BF16_OPERATIONS, || tiles::repeat_bf16(simd, ROUNDS * SUMS)));
+    }
+    #[cfg(target_arch = "x86_64")]
     if simd.has_bf16_dot() {
         // SAFETY: `has_bf16_dot` has just told that the CPU has the instruction.
         return Some(repeated(time, 64, || unsafe { x86::bf16_loop(std::hint::black_box(1)) }));
@@ -45,7 +49,11 @@ pub fn bf16_operations(simd: Simd, time: Duration) -> Option<f64> {
 /// Multiply-adds of int8 with i32 sums per second on this thread; `None` where the CPU has no such instruction.
 pub fn int8_operations(simd: Simd, time: Duration) -> Option<f64> {
     #[cfg(target_arch = "x86_64")]
-    if simd.level() == super::SimdLevel::Avx512 {
+    if simd.level() == SimdLevel::Amx {
+        return Some(repeated(time, tiles::INT8_OPERATIONS, || tiles::repeat_int8(simd, ROUNDS * SUMS)));
+    }
+    #[cfg(target_arch = "x86_64")]
+    if simd.level() == SimdLevel::Avx512 {
         // SAFETY: the token proves the level, which includes VNNI.
         return Some(repeated(time, 128, || unsafe { x86::int8_loop(std::hint::black_box(1)) }));
     }
@@ -124,7 +132,7 @@ mod tests {
         for simd in Simd::all() {
             assert!(f32_operations(simd, time) > 0.0);
             assert_eq!(bf16_operations(simd, time).is_some(), simd.has_bf16_dot());
-            assert_eq!(int8_operations(simd, time).is_some(), simd.level() == crate::kernels::SimdLevel::Avx512);
+            assert_eq!(int8_operations(simd, time).is_some(), simd.level() >= SimdLevel::Avx512);
         }
     }
 }

@@ -27,7 +27,7 @@ macro_rules! at_each_level {
         match $simd.level() {
             // SAFETY: the token proves that the CPU has the level's instructions.
             #[cfg(target_arch = "x86_64")]
-            SimdLevel::Avx512 => unsafe { avx512($($name),*) },
+            SimdLevel::Avx512 | SimdLevel::Amx => unsafe { avx512($($name),*) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             SimdLevel::Avx2 => unsafe { avx2($($name),*) },

@@ -122,7 +122,7 @@ pub fn next_near(
         SimdLevel::Avx2 => unsafe { x86::next_near_avx2(probe, rows, from, threshold, found) },
         #[cfg(target_arch = "x86_64")]
         // SAFETY: as above.
-        SimdLevel::Avx512 => unsafe { x86::next_near_avx512(probe, rows, from, threshold, found) },
+        SimdLevel::Avx512 | SimdLevel::Amx => unsafe { x86::next_near_avx512(probe, rows, from, threshold, found) },
         _ => next_near_scalar(probe, rows, from, threshold, found),
     }
 }
@@ -171,7 +171,7 @@ pub fn dot_products(simd: Simd, query: &Codes, rows: &[Codes], dots: &mut [i32])
         SimdLevel::Avx2 => unsafe { x86::avx2(query, rows, dots) },
         #[cfg(target_arch = "x86_64")]
         // SAFETY: as above.
-        SimdLevel::Avx512 => unsafe { x86::avx512(query, rows, dots) },
+        SimdLevel::Avx512 | SimdLevel::Amx => unsafe { x86::avx512(query, rows, dots) },
         _ => scalar(query, rows, dots),
     }
 }

@@ -5,12 +5,14 @@
 //! [`selected`] is what the process uses: the highest level of the CPU, or the one `PLACEFORMER_SIMD` forces. Asking
 //! for a level the CPU lacks is an error, never a quiet step down.
 
+#[cfg(target_arch = "x86_64")]
+use super::tiles;
 use crate::error::ErrorCode;
 use std::fmt;
 use std::str::FromStr;
 use std::sync::OnceLock;
 
-/// The environment variable that forces a level: `scalar`, `avx2` or `avx512`.
+/// The environment variable that forces a level: `scalar`, `avx2`, `avx512` or `amx`.
 pub const SIMD_VARIABLE: &str = "PLACEFORMER_SIMD";
 
 /// A family of instructions, each including those before it.
@@ -22,11 +24,13 @@ pub enum SimdLevel {
     Avx2,
     /// AVX-512 F, BW, DQ, VL and VNNI on top of [`SimdLevel::Avx2`].
     Avx512,
+    /// Tiles of bf16 and int8 (AMX), for matrix products, and AVX-512 BF16 on top of [`SimdLevel::Avx512`].
+    Amx,
 }
 
 impl SimdLevel {
     /// Every level, ascending.
-    pub const ALL: [Self; 3] = [Self::Scalar, Self::Avx2, Self::Avx512];
+    pub const ALL: [Self; 4] = [Self::Scalar, Self::Avx2, Self::Avx512, Self::Amx];
 
     /// The name [`SIMD_VARIABLE`] takes.
     pub fn as_str(self) -> &'static str {
@@ -34,6 +38,7 @@ impl SimdLevel {
             Self::Scalar => "scalar",
             Self::Avx2 => "avx2",
             Self::Avx512 => "avx512",
+            Self::Amx => "amx",
         }
     }
 
@@ -56,6 +61,7 @@ impl SimdLevel {
             Self::Scalar => true,
             Self::Avx2 => avx2(),
             Self::Avx512 => avx2() && avx512(),
+            Self::Amx => avx2() && avx512() && is_x86_feature_detected!("avx512bf16") && tiles::are_available(),
         }
     }
 
@@ -87,7 +93,7 @@ impl FromStr for SimdLevel {
 #[non_exhaustive]
 pub enum SimdError {
     /// The variable holds something else than a level.
-    #[error("{SIMD_VARIABLE}={value:?} is not a SIMD level; use scalar, avx2 or avx512, or leave it unset")]
+    #[error("{SIMD_VARIABLE}={value:?} is not a SIMD level; use scalar, avx2, avx512 or amx, or leave it unset")]
     UnknownLevel {
         /// What it holds.
         value: String,
@@ -155,15 +161,21 @@ impl Simd {
         SimdLevel::ALL.into_iter().filter(|level| level.is_available()).map(|level| Self { level })
     }
 
+    /// The lower of this level and `limit`.
+    pub fn at_most(self, limit: SimdLevel) -> Self {
+        // Each level includes those before it.
+        Self { level: self.level.min(limit) }
+    }
+
     /// The level proven.
     pub fn level(self) -> SimdLevel {
         self.level
     }
 
-    /// Whether `vdpbf16ps` may be used too: not every CPU of the highest level has it.
+    /// Whether `vdpbf16ps` may be used too: not every CPU of [`SimdLevel::Avx512`] has it.
     pub fn has_bf16_dot(self) -> bool {
         #[cfg(target_arch = "x86_64")]
-        return self.level == SimdLevel::Avx512 && is_x86_feature_detected!("avx512bf16");
+        return self.level >= SimdLevel::Avx512 && is_x86_feature_detected!("avx512bf16");
         #[cfg(not(target_arch = "x86_64"))]
         return false;
     }

@@ -169,7 +169,7 @@ impl PackedColumns {
             #[cfg(target_arch = "x86_64")]
             SimdLevel::Avx2 => avx2::pack(self, columns),
             #[cfg(target_arch = "x86_64")]
-            SimdLevel::Avx512 => avx512::pack(self, columns),
+            SimdLevel::Avx512 | SimdLevel::Amx => avx512::pack(self, columns),
             #[cfg(not(target_arch = "x86_64"))]
             level => unreachable!("a token for {level} cannot exist on this architecture"),
         }
@@ -268,7 +268,7 @@ pub fn block_maxima(
         SimdLevel::Avx2 => unsafe { avx2::block_maxima(columns, rows, wanted, scratch, out) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx512 => unsafe { avx512::block_maxima(columns, rows, wanted, scratch, out) },
+        SimdLevel::Avx512 | SimdLevel::Amx => unsafe { avx512::block_maxima(columns, rows, wanted, scratch, out) },
         #[cfg(not(target_arch = "x86_64"))]
         level => unreachable!("a token for {level} cannot exist on this architecture ({scratch:?})"),
     }

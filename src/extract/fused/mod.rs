@@ -23,12 +23,12 @@ use super::error::ExtractError;
 use super::positions::interpolate;
 use super::preset::{Geometry, LAYER_NORM_EPS};
 use super::weights::{Norm, VitWeights};
-use crate::kernels::Simd;
 use crate::kernels::aligned::AlignedBuffer;
 use crate::kernels::attention::{AttentionShape, chunk_rows, first_row_attention};
 use crate::kernels::elementwise::normalize_rows;
 use crate::kernels::gemm::Tiling;
 use crate::kernels::operand::Format;
+use crate::kernels::{Simd, SimdLevel};
 use crate::types::{ImageTensor, InvalidValue};
 use chunk::{Chunk, ChunkPlan, HIDDEN_SLICE, Scratch};
 use rayon::prelude::*;
@@ -93,6 +93,8 @@ impl FusedEncoder {
     ) -> Result<Self, ExtractError> {
         let geometry = weights.geometry;
         let (precision, formats) = choose_formats(simd, precision)?;
+        // Tiles do nothing for f32, and vectors of it are faster without regard to them.
+        let simd = if precision == Precision::F32 { simd.at_most(SimdLevel::Avx512) } else { simd };
         let (patch, size) = (geometry.patch, spec.input_size);
         if spec.blocks() > weights.blocks.len() {
             let reason = format!("block {} was asked for, there are {}", spec.blocks() - 1, weights.blocks.len());

@@ -59,7 +59,9 @@ impl Sampler {
         match simd.level() {
             // SAFETY: the token proves that the CPU has the level's instructions.
             #[cfg(target_arch = "x86_64")]
-            SimdLevel::Avx512 => unsafe { raw_avx512(self.counter, points, &mut positions, &mut different) },
+            SimdLevel::Avx512 | SimdLevel::Amx => unsafe {
+                raw_avx512(self.counter, points, &mut positions, &mut different)
+            },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             SimdLevel::Avx2 => unsafe { raw_avx2(self.counter, points, &mut positions, &mut different) },
