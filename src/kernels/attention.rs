@@ -24,11 +24,40 @@ pub fn chunk_rows(simd: Simd) -> usize {
 /// a head's values to stream by.
 const GROUP_SCORES: usize = 40 * 1024;
 
+/// How queries and keys are stored, and thereby how their products are computed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ScoreFormat {
+    /// As f32.
+    F32,
+    /// Rounded to bf16.
+    Bf16,
+    /// As the sum of two bf16, sixteen bits in all: three bf16 products, which matrix registers do sooner than vectors
+    /// do one of f32. Words of a row's dimensions hold the greater parts, then for queries the lesser and the greater
+    /// again, for keys the greater again and the lesser.
+    SplitBf16,
+}
+
+impl ScoreFormat {
+    /// The format of the products.
+    pub fn product(self) -> Format {
+        match self {
+            Self::F32 => Format::F32,
+            Self::Bf16 | Self::SplitBf16 => Format::Bf16,
+        }
+    }
+
+    /// Words that `count` numbers take.
+    fn words(self, count: usize) -> usize {
+        let parts = if self == Self::SplitBf16 { 3 } else { 1 };
+        parts * self.product().words(count)
+    }
+}
+
 /// How the tokens of an image and their heads are laid out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AttentionShape {
-    /// Format of queries and keys: f32 or bf16.
-    pub score_format: Format,
+    /// Format of queries and keys.
+    pub score_format: ScoreFormat,
     /// Format of weights and values: f32 or bf16.
     pub mix_format: Format,
     /// Tokens of an image, CLS included.
@@ -155,7 +184,7 @@ fn score(
         let at = panel / per_chunk * shape.keys_len() + head * shape.head_keys() + panel % per_chunk * panel_len;
         let right = Panel::whole(&keys[at..at + panel_len], shape.head_words());
         let out = &mut out[panel * columns..];
-        multiply_panel(simd, shape.score_format, rows, queries, right, out, shape.padded_tokens());
+        multiply_panel(simd, shape.score_format.product(), rows, queries, right, out, shape.padded_tokens());
     }
 }
 
@@ -235,14 +264,19 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
 }
 
 /// The formats of scores and of the mix that a level can.
-fn formats(simd: Simd) -> impl Iterator<Item = (Format, Format)> {
-    let pairs = [(Format::F32, Format::F32), (Format::F32, Format::Bf16), (Format::Bf16, Format::Bf16)];
-    pairs.into_iter().filter(move |pair| pair.0.is_available(simd) && pair.1.is_available(simd))
+fn formats(simd: Simd) -> impl Iterator<Item = (ScoreFormat, Format)> {
+    let pairs = [
+        (ScoreFormat::F32, Format::F32),
+        (ScoreFormat::F32, Format::Bf16),
+        (ScoreFormat::Bf16, Format::Bf16),
+        (ScoreFormat::SplitBf16, Format::Bf16),
+    ];
+    pairs.into_iter().filter(move |pair| pair.0.product().is_available(simd) && pair.1.is_available(simd))
 }
 
 /// Queries, keys and values `[tokens, dim]` of one image, laid out as the encoder does.
 fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, Vec<u32>, Vec<u32>) {
-    use super::operand::OperandBuffer;
+    use super::operand::{OperandBuffer, ScoreSide};
     let (columns, dim) = (Tiling::of(simd).columns, shape.heads * shape.head_dim);
     let nothing = f32::NAN.to_bits();
     let mut queries = vec![nothing; shape.padded_tokens() * shape.query_len()];
@@ -261,14 +295,11 @@ fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, 
             };
             let blocks = rows.map(block);
             let mut buffers = [(); 3].map(|()| OperandBuffer::default());
-            let formats = [shape.score_format, shape.score_format, shape.mix_format];
-            let mut words = buffers
-                .iter_mut()
-                .zip(&blocks)
-                .zip(formats)
-                .map(|((buffer, block), format)| buffer.pack(simd, format, filled, columns, (block, columns)).rows);
-            let mut next = || words.next().unwrap_or(Rows { data: &[], stride: 1 });
-            let (query, key, value) = (next(), next(), next());
+            let [of_query, of_key, of_value] = &mut buffers;
+            let block = |part: usize| (&blocks[part][..], columns);
+            let query = of_query.pack_scores(simd, shape.score_format, ScoreSide::Query, (filled, columns), block(0));
+            let key = of_key.pack_scores(simd, shape.score_format, ScoreSide::Key, (filled, columns), block(1));
+            let value = of_value.pack(simd, shape.mix_format, filled, columns, block(2)).rows;
             let first = chunk * shape.chunk_rows * shape.query_len();
             store_queries(shape, head, within, query, &mut queries[first..]);
             store_keys(simd, shape, head, within, key, &mut keys[of(shape.keys_len())]);
@@ -280,7 +311,7 @@ fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, 
 
 fn compare_with_definition(
     simd: Simd,
-    (score_format, mix_format): (Format, Format),
+    (score_format, mix_format): (ScoreFormat, Format),
     tokens: usize,
     heads: usize,
     head_dim: usize,
@@ -292,9 +323,10 @@ fn compare_with_definition(
     let (queries, keys, values) = lay_out(simd, &shape, [&query_rows, &key_rows, &value_rows]);
     // bf16 keeps eight bits: of the scores, then of the weights.
     let (of_values, of_weights) = match (score_format, mix_format) {
-        (Format::F32, Format::F32) => (1e-5, 1e-5),
-        (Format::F32, _) => (5e-3, 1e-5),
-        _ => (2e-2, 5e-3),
+        (ScoreFormat::F32, Format::F32) => (1e-5, 1e-5),
+        (ScoreFormat::F32, _) => (5e-3, 1e-5),
+        (ScoreFormat::SplitBf16, _) => (5e-3, 5e-5),
+        (ScoreFormat::Bf16, _) => (2e-2, 5e-3),
     };
     let rows = Tiling::of(simd).rows * 3;
     let (mut scratch, mut out) = (vec![f32::NAN; shape.scratch_len(simd)], vec![0.0; rows * dim]);

@@ -5,6 +5,7 @@
 
 use super::Simd;
 use super::aligned::AlignedBuffer;
+use super::attention::ScoreFormat;
 use super::gemm::covers;
 #[cfg(target_arch = "x86_64")]
 use super::lanes::{Avx2, Avx512};
@@ -81,6 +82,17 @@ pub struct Left<'a> {
 pub struct OperandBuffer {
     words: AlignedBuffer<u32>,
     factors: AlignedBuffer<f32>,
+    /// The greater and the lesser parts of a row.
+    parts: AlignedBuffer<f32>,
+}
+
+/// Which side of the scores' product a row is on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ScoreSide {
+    /// Its left-hand side.
+    Query,
+    /// Its right-hand side.
+    Key,
 }
 
 /// Widths that [`OperandBuffer::pack`] takes are multiples of this: a vector's length.
@@ -119,6 +131,48 @@ impl OperandBuffer {
             }
         }
         Left { rows: Rows { data: &self.words, stride: words }, factors: &self.factors }
+    }
+
+    /// As [`pack`](Self::pack), for rows of queries or keys, whose order of parts depends on their `side`.
+    ///
+    /// # Panics
+    /// As there.
+    pub fn pack_scores<'a>(
+        &'a mut self,
+        simd: Simd,
+        format: ScoreFormat,
+        side: ScoreSide,
+        (rows, width): (usize, usize),
+        (source, stride): (&'a [f32], usize),
+    ) -> Rows<'a> {
+        if format != ScoreFormat::SplitBf16 {
+            return self.pack(simd, format.product(), rows, width, (source, stride)).rows;
+        }
+        assert_eq!(width % width_step(simd), 0, "rows must be whole vectors wide");
+        assert!(rows == 0 || covers(source.len(), rows, stride, width), "source too short");
+        let words = Format::Bf16.words(width);
+        self.words.resize(rows * 3 * words);
+        self.parts.resize(2 * width);
+        let (greater, lesser) = self.parts.split_at_mut(width);
+        for (row, packed) in self.words.chunks_exact_mut(3 * words).enumerate() {
+            split_row(&source[row * stride..row * stride + width], greater, lesser);
+            let order: [&[f32]; 3] = match side {
+                ScoreSide::Query => [greater, lesser, greater],
+                ScoreSide::Key => [greater, greater, lesser],
+            };
+            for (part, packed) in order.into_iter().zip(packed.chunks_exact_mut(words)) {
+                round_row(simd, part, packed);
+            }
+        }
+        Rows { data: &self.words, stride: 3 * words }
+    }
+}
+
+/// The greater part of each number, its first eight bits, which bf16 holds exactly, and the lesser, what is left.
+fn split_row(source: &[f32], greater: &mut [f32], lesser: &mut [f32]) {
+    for ((value, greater), lesser) in source.iter().zip(greater).zip(lesser) {
+        *greater = f32::from_bits(value.to_bits() & 0xffff_0000);
+        *lesser = value - *greater;
     }
 }
 

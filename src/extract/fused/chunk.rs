@@ -8,7 +8,7 @@ use crate::kernels::aligned::AlignedBuffer;
 use crate::kernels::attention::{AttentionShape, attend, store_keys, store_queries, store_values};
 use crate::kernels::elementwise::{Epilogue, Product, finish_block, normalize_rows};
 use crate::kernels::gemm::{Tiling, multiply_panel};
-use crate::kernels::operand::{Left, OperandBuffer};
+use crate::kernels::operand::{Left, OperandBuffer, ScoreSide};
 use std::ops::Range;
 
 /// Width of the slice of the MLP's hidden layer that exists at a time.
@@ -114,12 +114,21 @@ impl ChunkPlan {
             finish_block(self.simd, Epilogue::Bias, product, hidden, columns);
             let (part, column) = (panel * columns / self.dim, panel * columns % self.dim);
             let (head, dim) = (column / head_dim, column % head_dim);
-            let format = if part == 2 { self.shape.mix_format } else { self.shape.score_format };
-            let finished = packed_block.pack(self.simd, format, rows, columns, (&hidden[..rows * columns], columns));
+            let (simd, shape, finished) = (self.simd, &self.shape, (&hidden[..rows * columns], columns));
+            let size = (rows, columns);
             match part {
-                0 => store_queries(&self.shape, head, dim, finished.rows, chunk.queries),
-                1 => store_keys(self.simd, &self.shape, head, dim, finished.rows, chunk.keys),
-                _ => store_values(self.simd, &self.shape, head, dim, finished.rows, chunk.values),
+                0 => {
+                    let words = packed_block.pack_scores(simd, shape.score_format, ScoreSide::Query, size, finished);
+                    store_queries(shape, head, dim, words, chunk.queries);
+                }
+                1 => {
+                    let words = packed_block.pack_scores(simd, shape.score_format, ScoreSide::Key, size, finished);
+                    store_keys(simd, shape, head, dim, words, chunk.keys);
+                }
+                _ => {
+                    let values = packed_block.pack(simd, shape.mix_format, rows, columns, finished);
+                    store_values(simd, shape, head, dim, values.rows, chunk.values);
+                }
             }
         });
     }

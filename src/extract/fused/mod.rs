@@ -6,8 +6,8 @@
 //! first-level cache. So a block of the transformer is one parallel loop over the chunks of all images, and scores and
 //! hidden activations never reach memory.
 //!
-//! Products are in f32, in bf16 but for the scores of attention, or in int8 with bf16 attention; everything between them
-//! is f32.
+//! Products are in f32, in bf16 but for the scores of attention (f32, or bf16 in two parts), or in int8 with bf16
+//! attention; everything between them is f32.
 //!
 //! No sum depends on how chunks are spread over threads or on other images, so a batch gives bit for bit what single
 //! images give. Buffers are kept between calls; in the steady state only the answer is allocated.
@@ -24,7 +24,7 @@ use super::positions::interpolate;
 use super::preset::{Geometry, LAYER_NORM_EPS};
 use super::weights::{Norm, VitWeights};
 use crate::kernels::aligned::AlignedBuffer;
-use crate::kernels::attention::{AttentionShape, chunk_rows, first_row_attention};
+use crate::kernels::attention::{AttentionShape, ScoreFormat, chunk_rows, first_row_attention};
 use crate::kernels::elementwise::normalize_rows;
 use crate::kernels::gemm::Tiling;
 use crate::kernels::operand::Format;
@@ -281,7 +281,7 @@ impl FusedEncoder {
 /// Formats of all products.
 struct Formats {
     layers: Format,
-    scores: Format,
+    scores: ScoreFormat,
     mix: Format,
 }
 
@@ -294,14 +294,15 @@ fn choose_formats(simd: Simd, precision: Precision) -> Result<(Precision, Format
     let (int8, bf16) = (Format::Int8.is_available(simd), Format::Bf16.is_available(simd));
     match precision {
         Precision::Auto => choose_formats(simd, if simd.has_bf16_dot() { Precision::Bf16 } else { Precision::F32 }),
-        Precision::F32 => Ok((precision, Formats { layers: Format::F32, scores: Format::F32, mix: Format::F32 })),
+        Precision::F32 => Ok((precision, Formats { layers: Format::F32, scores: ScoreFormat::F32, mix: Format::F32 })),
         Precision::Bf16 if bf16 => {
             // Scores are exponents: rounded to eight bits, the largest of them lose more than all else together.
-            Ok((precision, Formats { layers: Format::Bf16, scores: Format::F32, mix: Format::Bf16 }))
+            let scores = if simd.level() == SimdLevel::Amx { ScoreFormat::SplitBf16 } else { ScoreFormat::F32 };
+            Ok((precision, Formats { layers: Format::Bf16, scores, mix: Format::Bf16 }))
         }
         Precision::Bf16 => lacks("AVX-512 BF16"),
         Precision::Int8 if int8 && bf16 => {
-            Ok((precision, Formats { layers: Format::Int8, scores: Format::Bf16, mix: Format::Bf16 }))
+            Ok((precision, Formats { layers: Format::Int8, scores: ScoreFormat::Bf16, mix: Format::Bf16 }))
         }
         Precision::Int8 => lacks("AVX-512 VNNI and BF16"),
     }
