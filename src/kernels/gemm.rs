@@ -267,16 +267,17 @@ pub(super) fn covers(len: usize, rows: usize, stride: usize, width: usize) -> bo
 }
 
 /// The checked arguments of [`multiply_panel`].
-struct TileJob {
-    rows: usize,
-    left: *const u32,
-    left_stride: usize,
-    right: *const u32,
-    k: usize,
-    segment_rows: usize,
-    segment_stride: usize,
-    out: *mut u32,
-    out_stride: usize,
+#[derive(Clone, Copy)]
+pub(super) struct TileJob {
+    pub rows: usize,
+    pub left: *const u32,
+    pub left_stride: usize,
+    pub right: *const u32,
+    pub k: usize,
+    pub segment_rows: usize,
+    pub segment_stride: usize,
+    pub out: *mut u32,
+    pub out_stride: usize,
     /// Whether the sums go on from what `out` holds.
     adds: bool,
 }
@@ -291,36 +292,22 @@ impl TileJob {
             _ if self.k > self.segment_rows && !self.segment_rows.is_multiple_of(tiles::STEP) => 0,
             _ => self.k / tiles::STEP * tiles::STEP,
         };
+        let mut rest = *self;
         if whole > 0 {
-            let job = tiles::TileProduct {
-                rows: self.rows,
-                left: self.left,
-                left_stride: self.left_stride,
-                right: self.right,
-                k: whole,
-                segment_rows: self.segment_rows,
-                segment_stride: self.segment_stride,
-                out: self.out,
-                out_stride: self.out_stride,
-            };
             // SAFETY: `multiply_panel` has checked the extents, of which this is a part, and that rows are whole tiles;
             // segments are whole steps.
-            unsafe { job.run(simd, format) };
+            unsafe { tiles::multiply(simd, format, &Self { k: whole, ..*self }) };
+            if whole == self.k {
+                return;
+            }
+            let (segment, within) = (whole / self.segment_rows, whole % self.segment_rows);
+            rest.left = self.left.wrapping_add(whole);
+            rest.right = self.right.wrapping_add(segment * self.segment_stride + within * Tiling::of(simd).columns);
+            rest.k -= whole;
+            // What is left lies in one segment.
+            rest.segment_rows = rest.k;
+            rest.adds = true;
         }
-        if whole == self.k {
-            return;
-        }
-        let (segment, within) = (whole / self.segment_rows, whole % self.segment_rows);
-        let columns = Tiling::of(simd).columns;
-        let rest = Self {
-            left: self.left.wrapping_add(whole),
-            right: self.right.wrapping_add(segment * self.segment_stride + within * columns),
-            k: self.k - whole,
-            // What is left after whole steps lies in one segment; nothing is left out where no step was taken.
-            segment_rows: if whole > 0 { self.k - whole } else { self.segment_rows },
-            adds: whole > 0,
-            ..*self
-        };
         // SAFETY: `multiply_panel` has checked the extents, of which this is the rest; AMX includes these instructions.
         unsafe {
             match format {
@@ -523,6 +510,19 @@ mod tests {
                 };
                 let panel = Panel { data: &scattered, k, segment_rows, segment_stride };
                 prop_assert_eq!(run(panel), run(Panel::whole(&right, k)));
+            }
+        }
+    }
+
+    #[test]
+    fn a_product_over_nothing_is_zero() {
+        for simd in Simd::all() {
+            let tile = Tiling::of(simd);
+            for format in Format::ALL.into_iter().filter(|format| format.is_available(simd)) {
+                let mut out = vec![7.0; tile.rows * tile.columns];
+                let left = Rows { data: &[], stride: 0 };
+                multiply_panel(simd, format, tile.rows, left, Panel::whole(&[], 0), &mut out, tile.columns);
+                assert!(out.iter().all(|&sum| sum == 0.0), "{format:?}, {}", simd.level());
             }
         }
     }

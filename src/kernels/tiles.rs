@@ -5,6 +5,7 @@
 //! the end of a product, so that the system need not save it.
 
 use super::Simd;
+use super::gemm::TileJob;
 use super::operand::Format;
 use super::simd::SimdLevel;
 use std::arch::asm;
@@ -98,20 +99,6 @@ impl Drop for Registers {
     }
 }
 
-/// A product of some whole register rows with one panel of two registers' width, all of it whole steps long; the fields
-/// are those of [`multiply_panel`](super::gemm::multiply_panel).
-pub(super) struct TileProduct {
-    pub rows: usize,
-    pub left: *const u32,
-    pub left_stride: usize,
-    pub right: *const u32,
-    pub k: usize,
-    pub segment_rows: usize,
-    pub segment_stride: usize,
-    pub out: *mut u32,
-    pub out_stride: usize,
-}
-
 /// The loops over rows and segments, and the loop over a segment, for one instruction. Tiles 0 to 3 hold the sums (two
 /// below each other by two beside each other), 4 and 5 rows of the left, 6 and 7 of the right.
 macro_rules! product {
@@ -119,7 +106,7 @@ macro_rules! product {
         /// # Safety
         /// There are tiles, configured to their full size; extents are those that the fields tell, `rows` and `k` are
         /// whole tiles and steps, and so is `segment_rows` unless it covers `k`.
-        unsafe fn $name(job: &TileProduct) {
+        unsafe fn $name(job: &TileJob) {
             let mut row = 0;
             while row < job.rows {
                 let (left, out) =
@@ -213,21 +200,19 @@ macro_rules! product {
 product!(bf16_product, "tdpbf16ps");
 product!(int8_product, "tdpbusd");
 
-impl TileProduct {
-    /// Multiplies.
-    ///
-    /// # Safety
-    /// Pointers are valid for what the fields tell; `rows` are whole registers, `k` is whole steps, and so is
-    /// `segment_rows` unless it covers `k`.
-    pub(super) unsafe fn run(&self, simd: Simd, format: Format) {
-        let _registers = Registers::take(simd);
-        // SAFETY: the caller's; the registers are configured.
-        unsafe {
-            match format {
-                Format::Bf16 => bf16_product(self),
-                Format::Int8 => int8_product(self),
-                Format::F32 => unreachable!("tiles have no f32 products"),
-            }
+/// The whole of a product.
+///
+/// # Safety
+/// The job's pointers are valid for what its fields tell; `rows` are whole registers, the panel is two registers wide,
+/// `k` is whole steps, and so is `segment_rows` unless it covers `k`.
+pub(super) unsafe fn multiply(simd: Simd, format: Format, job: &TileJob) {
+    let _registers = Registers::take(simd);
+    // SAFETY: the caller's; the registers are configured.
+    unsafe {
+        match format {
+            Format::Bf16 => bf16_product(job),
+            Format::Int8 => int8_product(job),
+            Format::F32 => unreachable!("tiles have no f32 products"),
         }
     }
 }
