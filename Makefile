@@ -65,6 +65,7 @@ clippy: ## Lints; warnings are errors
 .PHONY: deny
 deny: .venv/tools ## Licences, bans and sources of dependencies
 	cargo fetch --locked
+	cargo fetch --locked --manifest-path fuzz/Cargo.toml
 	cargo deny --offline --all-features check bans licenses sources
 
 .PHONY: advisories

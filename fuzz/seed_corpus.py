@@ -29,8 +29,8 @@ def png(width, height, colour, depth, row_bytes, extra=b""):
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + extra + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
-def palette():
-    body = bytes(range(48))
+def palette(length=48):
+    body = bytes(range(length))
     return struct.pack(">I", len(body)) + b"PLTE" + body + struct.pack(">I", zlib.crc32(b"PLTE" + body))
 
 
@@ -59,6 +59,7 @@ def image_seeds():
         "png_grey_alpha": png(3, 3, 4, 8, 6),
         "png_rgba": png(2, 5, 6, 8, 8),
         "png_palette": png(4, 4, 3, 4, 2, palette()),
+        "png_palette_of_half_a_colour": png(4, 4, 3, 4, 2, palette(16)),
         "png_one_row": png(64, 1, 0, 1, 8),
         "png_truncated": png(5, 3, 2, 8, 15)[:-20],
         "png_huge_header": png(50000, 50000, 2, 8, 0)[:60],

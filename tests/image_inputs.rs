@@ -301,6 +301,25 @@ fn a_file_cut_anywhere_is_refused_and_says_so() {
     }
 }
 
+/// Found by the fuzz target `image`: the PNG decoder panics on a palette that is no whole number of colours.
+#[test]
+fn a_palette_of_half_a_colour_is_refused_although_the_decoder_panics() {
+    let chunk = |kind: &[u8; 4], data: &[u8]| {
+        let content = [kind, data].concat();
+        let crc = crc32fast::hash(&content).to_be_bytes();
+        [&(data.len() as u32).to_be_bytes()[..], &content, &crc].concat()
+    };
+    let header = [0, 0, 0, 2, 0, 0, 0, 1, 8, 3, 0, 0, 0];
+    // One row of two pixels behind its filter byte, in a stored block of zlib.
+    let pixels = [0x78, 0x01, 0x01, 3, 0, 0xfc, 0xff, 0, 0, 1, 0, 4, 0, 2];
+    let png = |palette: &[u8]| {
+        let chunks = [chunk(b"IHDR", &header), chunk(b"PLTE", palette), chunk(b"IDAT", &pixels), chunk(b"IEND", &[])];
+        [&b"\x89PNG\r\n\x1a\n"[..], &chunks.concat()].concat()
+    };
+    assert_eq!(default_decode(&png(&[1, 2, 3, 4, 5, 6])).unwrap().pixels, [1, 2, 3, 4, 5, 6]);
+    assert_eq!(code(&png(&[1, 2, 3, 4])), "image_undecodable");
+}
+
 #[test]
 fn a_jpeg_of_thousands_of_scans_is_refused_before_it_is_decoded() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/images");
