@@ -90,6 +90,9 @@ impl Best {
     }
 }
 
+/// Lanes of the longest vectors of f32.
+const MOST_LANES: usize = 16;
+
 /// The maxima of every wanted block; [`Best::NONE`] where a block was not wanted or is empty.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct BlockMaxima {
@@ -234,16 +237,27 @@ impl Scratch {
     }
 
     /// The best over the lanes of padded row `row`, ties to the lowest column.
+    #[inline(always)]
     fn reduce_lanes(&self, row: usize, lanes: usize) -> Best {
         let lane = row * lanes..(row + 1) * lanes;
-        let mut best = Best::NONE;
-        for (&value, &index) in self.lane_values[lane.clone()].iter().zip(&self.lane_indices[lane]) {
-            let index = index as u32;
-            if value > best.value || (value == best.value && index < best.index) {
-                best = Best { value, index };
-            }
+        // As many as the longest vectors have; what is missing loses to everything.
+        let (mut values, mut columns) = ([f32::NEG_INFINITY; MOST_LANES], [u32::MAX; MOST_LANES]);
+        values[..lanes].copy_from_slice(&self.lane_values[lane.clone()]);
+        for (column, &index) in columns.iter_mut().zip(&self.lane_indices[lane]) {
+            *column = index as u32;
         }
-        best
+        // By halves and without branches, so that the compiler makes vectors of it: which lane is best is anyone's guess.
+        let mut half = MOST_LANES / 2;
+        while half > 0 {
+            for lane in 0..half {
+                let (value, column) = (values[lane + half], columns[lane + half]);
+                let better = (value > values[lane]) | ((value == values[lane]) & (column < columns[lane]));
+                values[lane] = if better { value } else { values[lane] };
+                columns[lane] = if better { column } else { columns[lane] };
+            }
+            half /= 2;
+        }
+        Best { value: values[0], index: columns[0] }
     }
 }
 

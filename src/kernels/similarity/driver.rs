@@ -196,6 +196,7 @@ impl<L: Level<TILE>, const TILE: usize> ColumnBests<L, TILE> {
 }
 
 /// Reduces the lanes of every row that exists.
+#[inline(always)]
 fn collect_rows<const TILE: usize>(rows: Quantised<'_>, scratch: &Scratch, lanes: usize, bests: &mut [Best]) {
     let mut padded = 0;
     for section in 0..SECTIONS {
