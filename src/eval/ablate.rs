@@ -7,6 +7,7 @@
 //! separate extraction would (key patches come by attention descending, and both rules cut that order off).
 
 mod cuts;
+mod full_precision;
 
 use super::EvalError;
 use super::datasets::{Dataset, Truth};
@@ -84,7 +85,15 @@ pub fn ablate(
     for group in variants.chunk_by(|a, b| a.extract == b.extract) {
         let features = Prepared::new(dataset, base, &group[0].extract, open, progress)?;
         for variant in group {
-            rows.push(features.row(dataset, variant, progress)?);
+            match features.row(dataset, variant, progress)? {
+                Some(row) => rows.push(row),
+                None => {
+                    let text =
+                        format!("left out {} {}: its descriptors need more memory", variant.axis, variant.setting);
+                    // A line of the terminal that cannot be written is no reason to end.
+                    let _ = progress.println(text);
+                }
+            }
             bar.inc(1);
         }
     }
@@ -93,6 +102,8 @@ pub fn ablate(
 }
 
 struct Prepared {
+    describer: Box<dyn Describe>,
+    memory_bytes: u64,
     cache: FeatureCache,
     database: Features,
     queries: Features,
@@ -116,10 +127,17 @@ impl Prepared {
         let (database, queries) = (side(&dataset.database, "database")?, side(&dataset.queries, "query")?);
         bar.finish_and_clear();
         let (answers, _) = search_all(&database, &queries, |_| base.candidates);
-        Ok(Self { cache, database, queries, answers, components: OnceCell::new() })
+        let (memory_bytes, components) = (base.memory_bytes, OnceCell::new());
+        Ok(Self { describer, memory_bytes, cache, database, queries, answers, components })
     }
 
-    fn row(&self, dataset: &Dataset, variant: &Variant, progress: &MultiProgress) -> Result<AblationRow, EvalError> {
+    /// None where a row needs more memory than is allowed.
+    fn row(
+        &self,
+        dataset: &Dataset,
+        variant: &Variant,
+        progress: &MultiProgress,
+    ) -> Result<Option<AblationRow>, EvalError> {
         let bar = progress.add(ProgressBar::new(self.answers.len() as u64).with_message(variant.setting.clone()));
         let (cache, components) = (&self.cache, self.components(variant.cut)?);
         let patches = |features: &Features, index: usize| {
@@ -129,10 +147,20 @@ impl Prepared {
                 cut => Arc::new(apply(&whole, cut, components)?),
             })
         };
-        let answers = self.answers.clone();
-        let (answers, seconds) = rerank_all(&patches, &self.database, &self.queries, answers, &variant.rerank, &bar)?;
+        let (answers, rerank_seconds, patch_bytes) = if variant.cut == Cut::FullPrecision {
+            let (describer, bound) = (&*self.describer, self.memory_bytes);
+            match full_precision::rerank_all(describer, dataset, &self.answers, &variant.rerank, bound, &bar)? {
+                None => return Ok(None),
+                Some(full) => (full.answers, full.seconds, self.database.patch_bytes + full.extra_bytes),
+            }
+        } else {
+            let answers = self.answers.clone();
+            let (answers, seconds) =
+                rerank_all(&patches, &self.database, &self.queries, answers, &variant.rerank, &bar)?;
+            (answers, seconds.rerank, self.patch_bytes(variant)?)
+        };
         bar.finish_and_clear();
-        Ok(AblationRow {
+        Ok(Some(AblationRow {
             axis: variant.axis,
             setting: variant.setting.clone(),
             recall: Both {
@@ -140,9 +168,9 @@ impl Prepared {
                 reranked: Some(recall(dataset, &answers, Answer::reranked_ranking)),
             },
             extract_seconds: self.database.seconds.extract,
-            rerank_seconds: seconds.rerank,
-            patch_bytes: self.patch_bytes(variant)?,
-        })
+            rerank_seconds,
+            patch_bytes,
+        }))
     }
 
     /// The components that `cut` needs, from the database's own key patches: no label is looked at.
@@ -168,7 +196,7 @@ impl Prepared {
     /// Mean size of what the store would keep.
     fn patch_bytes(&self, variant: &Variant) -> Result<f64, EvalError> {
         let bits = match variant.cut {
-            Cut::None => return Ok(self.database.patch_bytes),
+            Cut::None | Cut::FullPrecision => return Ok(self.database.patch_bytes),
             Cut::Limits { .. } => 8,
             Cut::Codec(codec) => codec.bits(),
         };
@@ -211,6 +239,7 @@ fn variants(base: &Base<'_>) -> Result<Vec<Variant>, EvalError> {
     let bare = ExtractConfig { head: HeadChoice::None, ..extract.clone() };
     let mut rows = Rows { rerank: base.rerank, rows: Vec::new() };
     rows.scales(&extract).map_err(invalid)?;
+    rows.push("codec", "f32".into(), false, &extract, Cut::FullPrecision);
     for codec in CODEC_ROWS {
         rows.push("codec", codec.name(), codec == Codec::INT8, &extract, Cut::Codec(codec));
     }

@@ -10,7 +10,7 @@ use super::datasets::Item;
 use crate::extract::Extractor;
 use crate::image::{ImageConfig, load_tensor};
 use crate::store::codec;
-use crate::types::{ContentHash, Descriptor, ImageTensor, ModelId, PackedPatches};
+use crate::types::{ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, PackedPatches};
 use indicatif::ProgressBar;
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
@@ -32,6 +32,8 @@ pub trait Describe: Sync {
     fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String>;
     /// One descriptor per image.
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, EvalError>;
+    /// The key patches of an image in full precision.
+    fn key_patches(&self, image: &ImageTensor) -> Result<KeyPatches, EvalError>;
 }
 
 /// The model at work.
@@ -57,6 +59,11 @@ impl Describe for ModelDescriber {
 
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, EvalError> {
         Ok(self.extractor.extract(images)?)
+    }
+
+    fn key_patches(&self, image: &ImageTensor) -> Result<KeyPatches, EvalError> {
+        let described = self.extractor.extract_full(std::slice::from_ref(image))?.pop();
+        described.map(|(_, patches)| patches).ok_or_else(|| EvalError::Setting("one image gave no descriptor".into()))
     }
 }
 

@@ -13,6 +13,8 @@ pub(super) enum Cut {
         tau: f32,
         caps: [usize; SCALES],
     },
+    /// Not cut but described once more, in f32.
+    FullPrecision,
     /// Descriptors as another codec would give them back.
     Codec(Codec),
 }
@@ -56,6 +58,7 @@ pub(super) fn apply(
 ) -> Result<PackedPatches, EvalError> {
     match cut {
         Cut::None => Ok(patches.clone()),
+        Cut::FullPrecision => Err(EvalError::Setting("full precision cannot be had from stored patches".into())),
         Cut::Limits { tau, caps } => Ok(limit(patches, tau, caps)),
         Cut::Codec(Codec::Bits(bits)) => Ok(coarsen(patches, bits)),
         Cut::Codec(Codec::Components(_)) => match components {

@@ -3,7 +3,9 @@
 use super::cuts::{coarsen, limit};
 use super::*;
 use crate::eval::datasets::Item;
-use crate::types::{Descriptor, ImageTensor, ModelId, PackedPatches, PatchGrid, PoolingStride};
+use crate::types::{
+    Descriptor, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid, PoolingStride, ScaleKeyPatches,
+};
 use half::f16;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -103,6 +105,21 @@ impl Describe for Fake {
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, EvalError> {
         Ok(images.iter().map(|image| self.one(image.data[0] as u64)).collect())
     }
+
+    fn key_patches(&self, image: &ImageTensor) -> Result<KeyPatches, EvalError> {
+        let packed = self.one(image.data[0] as u64).patches;
+        let mut vectors = unpack(&packed);
+        let scale = |scale: usize| {
+            let rows = packed.rows(scale);
+            ScaleKeyPatches {
+                index: packed.index[rows.clone()].iter().map(|&index| u32::from(index)).collect(),
+                attention: packed.attention[rows.clone()].iter().map(|attention| attention.to_f32()).collect(),
+                descriptors: vectors.by_ref().take(rows.len()).flatten().collect(),
+            }
+        };
+        let scales = [1, 2, 3].map(scale);
+        Ok(KeyPatches { grid: packed.grid, dim: packed.dim, scales })
+    }
 }
 
 impl Fake {
@@ -185,14 +202,21 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
     let prepared = prepared.unwrap();
     for variant in few_rows {
         let Cut::Limits { tau, caps } = variant.cut else { panic!("{}", variant.setting) };
-        let cut = prepared.row(&dataset, &variant, &hidden).unwrap();
+        let cut = prepared.row(&dataset, &variant, &hidden).unwrap().unwrap();
         let config = ExtractConfig { tau, caps: caps.map(|cap| cap.min(1 << 16)), ..bare(&few) };
         let own = Prepared::new(&dataset, &few_base, &config, &open, &hidden).unwrap();
-        let own = own.row(&dataset, &Variant { cut: Cut::None, ..variant }, &hidden).unwrap();
+        let own = own.row(&dataset, &Variant { cut: Cut::None, ..variant }, &hidden).unwrap().unwrap();
         assert_eq!((&cut.recall, cut.patch_bytes), (&own.recall, own.patch_bytes), "{}", cut.setting);
     }
     // A codec of fewer bits or components is smaller; the base is the same on every axis.
     assert!(row("codec", "int4 simulated").patch_bytes < row("codec", "int8 *").patch_bytes);
+    // Full precision recalls as much here, and is left out where it would not fit.
+    let (full, int8) = (row("codec", "f32"), row("codec", "int8 *"));
+    assert_eq!(full.recall, int8.recall);
+    assert!(full.patch_bytes > 2.0 * int8.patch_bytes);
+    let small = ablate(&dataset, &Base { memory_bytes: 5000, ..base }, &open, &hidden).unwrap();
+    assert_eq!(small.len() + 1, rows.len());
+    assert!(!small.iter().any(|row| row.setting == "f32"));
     let starred: Vec<_> = rows.iter().filter(|row| row.setting.ends_with('*')).collect();
     assert_eq!(starred.len(), 7);
     assert!(starred.iter().all(|row| row.recall == starred[0].recall && row.patch_bytes == starred[0].patch_bytes));
