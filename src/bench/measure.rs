@@ -1,24 +1,40 @@
 //! Two things timed in turn.
 
+use std::convert::Infallible;
 use std::hint::black_box;
 use std::time::Instant;
 
 /// Medians in milliseconds of `ours` and `baseline`, run in turn `rounds` times after one unmeasured run of each.
 pub(super) fn paired<A, B>(rounds: usize, mut ours: impl FnMut() -> A, mut baseline: impl FnMut() -> B) -> (f64, f64) {
-    black_box(ours());
-    black_box(baseline());
-    let (mut our_times, mut baseline_times) = (Vec::new(), Vec::new());
+    let run = |work: &mut dyn FnMut()| -> Result<(), Infallible> {
+        work();
+        Ok(())
+    };
+    let (mut ours, mut baseline) = (|| drop(black_box(ours())), || drop(black_box(baseline())));
+    let Ok([ours, baseline]) = in_turn(rounds, [&mut || run(&mut ours), &mut || run(&mut baseline)]);
+    (ours, baseline)
+}
+
+/// Medians in milliseconds of several works, run in turn `rounds` times after one unmeasured run of each.
+///
+/// # Errors
+/// The first that a work fails with.
+pub(super) fn in_turn<const N: usize, E>(
+    rounds: usize,
+    mut works: [&mut dyn FnMut() -> Result<(), E>; N],
+) -> Result<[f64; N], E> {
+    works.iter_mut().try_for_each(|work| work())?;
+    let mut times = [const { Vec::new() }; N];
     for round in 0..rounds {
-        // Who goes first changes, so that neither always finds the caches as the other left them.
-        if round % 2 == 0 {
-            our_times.push(milliseconds(&mut ours));
-            baseline_times.push(milliseconds(&mut baseline));
-        } else {
-            baseline_times.push(milliseconds(&mut baseline));
-            our_times.push(milliseconds(&mut ours));
+        // Who goes first changes, so that nobody always finds the caches as the same other left them.
+        for place in 0..N {
+            let number = (round + place) % N;
+            let mut outcome = Ok(());
+            times[number].push(milliseconds(|| outcome = works[number]()));
+            outcome?;
         }
     }
-    (median(our_times), median(baseline_times))
+    Ok(times.map(median))
 }
 
 /// Time of one run.
@@ -55,5 +71,16 @@ mod tests {
         let (a, b) = paired(5, || ours += 1, || baseline += 1);
         assert_eq!((ours, baseline), (6, 6));
         assert!(a >= 0.0 && b >= 0.0);
+    }
+
+    #[test]
+    fn a_failure_ends_the_measurement() {
+        let mut left = 3;
+        let mut failing = || {
+            left -= 1;
+            if left == 0 { Err("enough") } else { Ok(()) }
+        };
+        assert_eq!(in_turn(5, [&mut failing, &mut || Ok(())]), Err("enough"));
+        assert_eq!(left, 0);
     }
 }

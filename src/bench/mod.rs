@@ -6,7 +6,7 @@
 //! | `measure` | ours and the baseline in turn, so that what disturbs one disturbs the other |
 //! | [`scenes`] | the inputs: a drawn photo, key patches with planted inliers, random references |
 //! | [`baselines`] | the plain implementations |
-//! | `stages`, `candidates` | the rows |
+//! | `stages`, `candidates`, `ingest`, `rehead` | the rows |
 //! | [`filled`] | a store that shows more references than it holds |
 //!
 //! The Criterion benchmarks use the same inputs and baselines.
@@ -14,8 +14,10 @@
 pub mod baselines;
 mod candidates;
 pub mod filled;
+mod ingest;
 mod limits;
 mod measure;
+mod rehead;
 pub mod scenes;
 mod stages;
 

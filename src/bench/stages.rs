@@ -25,7 +25,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 /// The rows there are, in the order they are measured. `search_10m` takes 14 GB and runs only when it is named.
-pub const NAMES: [&str; 15] = [
+pub const NAMES: [&str; 18] = [
     "decode_resize_1080p",
     "extract",
     "extract_batch8",
@@ -41,6 +41,9 @@ pub const NAMES: [&str; 15] = [
     "search_1m",
     "search_10m",
     "query_1m",
+    "commit",
+    "ingest",
+    "rehead_100k",
 ];
 
 /// Neighbours asked for.
@@ -149,6 +152,9 @@ impl Bench {
             "search_1m" => self.search("search_1m", 1_000_000),
             "search_10m" => self.search("search_10m", 10_000_000),
             "query_1m" => self.query(),
+            "commit" => self.commit(),
+            "ingest" => self.ingest(),
+            "rehead_100k" => self.rehead(),
             other => Err(BenchError::UnknownRow { name: other.to_owned() }),
         }
     }
@@ -285,7 +291,7 @@ impl Bench {
     }
 
     /// A service over `store` with `extra` made-up references in each map.
-    fn service(&self, store: SqliteStore, extra: u64) -> Result<Arc<Service>, BenchError> {
+    pub(super) fn service(&self, store: SqliteStore, extra: u64) -> Result<Arc<Service>, BenchError> {
         let metrics = Metrics::new().map_err(|error| BenchError::Setup(error.to_string()))?;
         Ok(Service::start(Parts {
             store: Arc::new(FilledStore::new(store, extra)?),
