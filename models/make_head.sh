@@ -36,20 +36,26 @@ town() {
 }
 # Town 7 is the demo's, 11 to 13 are the calibration's.
 for seed in 1 2; do town "learnt$seed" --places "$places" --views 2 --seed "$seed"; done
+town learnt3 --places $((places * 3 / 2)) --views 3 --seed 3
 for seed in 21 22; do town "held$seed" --places "$places" --views 3 --conditions dusk,dusk,overcast --seed "$seed"; done
+# Says when to stop training; it takes no part in the choice.
+town validation31 --places "$places" --views 3 --conditions dusk,dusk,overcast --seed 31
 for seed in 23 24; do town "distractor$seed" --places "$places" --views 2 --seed "$seed"; done
 rm -rf train drives towns
 python3 "$models/head_data.py" . --drives "$camvid" \
   --town held21 --town held22 --distractor distractor23 --distractor distractor24
 
 mkdir -p heads results
+# Pictures of a third town make every PCA recall less, on photographs and in towns; triplets need them.
 for aggregate in mean gem vlad; do
   [ -f "heads/pca-$aggregate.safetensors" ] || "$placeformer" head fit "${flags[@]}" --aggregate "$aggregate" \
     --images train learnt1 learnt2 --out "heads/pca-$aggregate.safetensors"
 done
 [ -f heads/triplets-mean.safetensors ] || {
-  "$placeformer" head train "${flags[@]}" --head heads/pca-mean.safetensors --cache cache/pooled \
-    --drives train/* --dataset csv --root learnt1 --dataset csv --root learnt2 --out run
+  # The paper's margin of 0.01 is met by nearly every triplet before the first step: there is nothing to learn from.
+  "$placeformer" head train "${flags[@]}" --head heads/pca-mean.safetensors --cache cache/pooled --margin 0.3 \
+    --patience 15 --drives train/* --dataset csv --root learnt1 --dataset csv --root learnt2 --dataset csv --root learnt3 \
+    --validation-dataset csv --validation-root validation31 --out run
   cp run/head.safetensors heads/triplets-mean.safetensors
 }
 
@@ -66,7 +72,8 @@ done
 count() { find -L "$@" -name '*.jpg' | wc -l; }
 python3 "$models/select_head.py" results --heads heads --sets drives towns --baseline no-head \
   --table "$result/selection.md" --winner "$result/dinov2-vits14-b8.safetensors" \
-  --data "Made from $(count train) frames of CamVid stretches and $(count learnt1 learnt2) pictures of two drawn towns. \
+  --data "Made from $(count train) frames of CamVid stretches and $(count learnt1 learnt2) pictures of two drawn towns, \
+the triplets also of $(count learnt3) of a third. \
 Chosen by other stretches of the drives, among $(count drives/database) references of which most show places that nobody \
 asks for, and by two other towns, seen from further sides and mostly at dusk, among $(count towns/database) references \
 of four towns."
