@@ -279,6 +279,9 @@ fn violations(file: &Path, room: &str, found: &Names, rooms: &BTreeSet<String>) 
     if room != "cli" && room != "main" {
         let printing = TERMINAL_MACROS.iter().filter(|name| found.macros.contains(**name));
         broken.extend(printing.map(|name| format!("{}: `{name}!` in a library room; use tracing", file.display())));
+    } else {
+        let panicking = ["println", "print"].into_iter().filter(|name| found.macros.contains(*name));
+        broken.extend(panicking.map(|name| format!("{}: `{name}!` panics on a closed pipe; use say!", file.display())));
     }
     broken
 }
@@ -366,6 +369,7 @@ fn every_rule_can_fail() {
     assert!(broken("store", "fn f() { unsafe { g() } }").contains("`unsafe` belongs to"));
     assert!(broken("store", "unsafe fn f() {}").contains("`unsafe` belongs to"));
     assert!(broken("store", "fn f() { println!(\"x\") }").contains("`println!`"));
+    assert!(broken("cli", "fn f() { println!(\"x\") }").contains("closed pipe"));
     assert!(broken("attic", "").contains("no row in the table"));
     for (room, source) in [
         ("store", "use crate::types::MapName; use rusqlite::Connection; #[allow(unsafe_code)] fn f() { self::g(); }"),

@@ -1,5 +1,6 @@
 //! Copy a store to a file while a server may be using it.
 
+use crate::cli::output::say;
 use crate::config::{Config, Overrides};
 use crate::store::SqliteStore;
 use anyhow::{Context, ensure};
@@ -28,6 +29,6 @@ pub fn run(args: BackupArgs) -> anyhow::Result<()> {
     let target = args.out.join(SqliteStore::DATABASE);
     let bytes = SqliteStore::backup_of(&args.data, &config.store, &target)
         .with_context(|| format!("cannot back up {}", args.data.display()))?;
-    println!("{}: {bytes} bytes", target.display());
+    say!("{}: {bytes} bytes", target.display())?;
     Ok(())
 }

@@ -93,3 +93,21 @@ impl ServerClient {
         bail!("{} ({}): {} [request {}]", text("title"), status.as_u16(), text("detail"), text("request_id"))
     }
 }
+
+/// Resident bytes of a server, from what it answers at `/metrics`.
+pub(super) fn resident_bytes(metrics: &str) -> Option<u64> {
+    let line = metrics.lines().find(|line| line.starts_with("process_resident_memory_bytes "))?;
+    line.split_whitespace().nth(1)?.parse::<f64>().ok().map(|bytes| bytes as u64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn resident_memory_is_read_from_the_exposition_format() {
+        let text = "# TYPE process_resident_memory_bytes gauge\nprocess_resident_memory_bytes 123456789\n";
+        assert_eq!(resident_bytes(text), Some(123_456_789));
+        assert_eq!(resident_bytes("something_else 1\n"), None);
+    }
+}

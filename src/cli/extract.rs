@@ -1,6 +1,7 @@
 //! Show every intermediate of extraction.
 
 use super::model_args::ModelOptions;
+use crate::cli::output::{OutputError, say};
 use crate::extract::{ExtractionTrace, Extractor, TraceArray, TraceValues};
 use crate::image::{ImageConfig, load_tensor};
 use anyhow::Context;
@@ -35,8 +36,8 @@ pub fn run(args: ExtractArgs) -> anyhow::Result<()> {
         write_safetensors(path, &trace, &extractor)?;
     }
     match args.json {
-        true => println!("{}", serde_json::to_string(&as_json(&trace, &extractor))?),
-        false => print_summary(&trace, &extractor),
+        true => say!("{}", serde_json::to_string(&as_json(&trace, &extractor))?)?,
+        false => print_summary(&trace, &extractor)?,
     }
     Ok(())
 }
@@ -73,16 +74,17 @@ fn write_safetensors(path: &Path, trace: &ExtractionTrace, extractor: &Extractor
     safetensors::serialize_to_file(views?, Some(metadata), path).with_context(|| path.display().to_string())
 }
 
-fn print_summary(trace: &ExtractionTrace, extractor: &Extractor) {
-    println!("model {}", extractor.model_id());
+fn print_summary(trace: &ExtractionTrace, extractor: &Extractor) -> Result<(), OutputError> {
+    say!("model {}", extractor.model_id())?;
     for array in trace.arrays() {
         let shape = array.shape.iter().map(usize::to_string).collect::<Vec<_>>().join("x");
         let (low, high, mean) = match &array.values {
             TraceValues::F32(values) => range(values.iter().map(|&v| v as f64)),
             TraceValues::I64(values) => range(values.iter().map(|&v| v as f64)),
         };
-        println!("{:32} {shape:>12}  min {low:>10.4}  max {high:>10.4}  mean {mean:>10.4}", array.name);
+        say!("{:32} {shape:>12}  min {low:>10.4}  max {high:>10.4}  mean {mean:>10.4}", array.name)?;
     }
+    Ok(())
 }
 
 fn range(values: impl Iterator<Item = f64> + Clone) -> (f64, f64, f64) {

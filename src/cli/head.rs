@@ -2,6 +2,7 @@
 
 use super::model_args::ModelOptions;
 use super::train::{HeadTrainArgs, train_head};
+use crate::cli::output::say;
 use crate::eval::datasets::list_images as images_below;
 use crate::extract::{
     Aggregate, Covariance, ExtractConfig, Extractor, Head, HeadChoice, VladWords, half_whitened_head_of_few, hash_file,
@@ -108,8 +109,8 @@ fn fit(args: FitArgs) -> anyhow::Result<()> {
         std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
     }
     head.save(&args.out)?;
-    println!("{} ({}) from {images} images for {}", args.out.display(), head.aggregate(), head.backbone());
-    println!("sha256 {}", hash_file(&args.out)?);
+    say!("{} ({}) from {images} images for {}", args.out.display(), head.aggregate(), head.backbone())?;
+    say!("sha256 {}", hash_file(&args.out)?)?;
     Ok(())
 }
 

@@ -1,6 +1,7 @@
 //! Ask a running server whether it is ready.
 
 use super::client::{ServerArgs, ServerClient};
+use crate::cli::output::say;
 use anyhow::ensure;
 
 /// Arguments of this subcommand.
@@ -28,6 +29,6 @@ pub fn run(args: HealthcheckArgs) -> anyhow::Result<()> {
     };
     let (status, body) = ServerClient::new(args.server)?.probe(path)?;
     ensure!(status == 200, "not ready ({status}): {body}");
-    println!("{body}");
+    say!("{body}")?;
     Ok(())
 }

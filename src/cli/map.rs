@@ -1,6 +1,7 @@
 //! Inspect and delete maps of a running server; give maps another head, there or in a data directory.
 
 use super::client::{ServerArgs, ServerClient};
+use crate::cli::output::{say, say_part};
 use crate::config::{Config, Overrides};
 use crate::extract::Head;
 use crate::store::{HeadExchange, NewHead};
@@ -10,7 +11,7 @@ use clap::Subcommand;
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use serde_json::Value;
-use std::io::{self, Write};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -95,7 +96,7 @@ pub fn run(args: MapArgs) -> anyhow::Result<()> {
         Action::List { server } => list(&ServerClient::new(server)?),
         Action::Show { map, server } => {
             let answer = ServerClient::new(server)?.get(&format!("/maps/{map}"))?;
-            println!("{}", serde_json::to_string_pretty(&answer)?);
+            say!("{}", serde_json::to_string_pretty(&answer)?)?;
             Ok(())
         }
         Action::Delete { map, yes, server } => delete(&ServerClient::new(server)?, &map, yes),
@@ -106,10 +107,10 @@ pub fn run(args: MapArgs) -> anyhow::Result<()> {
 fn list(client: &ServerClient) -> anyhow::Result<()> {
     let answer = client.get("/maps")?;
     let maps = answer["maps"].as_array().map(Vec::as_slice).unwrap_or_default();
-    println!("{:<32} {:>12}  model", "map", "references");
+    say!("{:<32} {:>12}  model", "map", "references")?;
     for map in maps {
         let text = |key: &str| map[key].as_str().unwrap_or_default();
-        println!("{:<32} {:>12}  {}", text("name"), map["references"].as_u64().unwrap_or_default(), text("model"));
+        say!("{:<32} {:>12}  {}", text("name"), map["references"].as_u64().unwrap_or_default(), text("model"))?;
     }
     Ok(())
 }
@@ -121,13 +122,12 @@ fn delete(client: &ServerClient, map: &MapName, yes: bool) -> anyhow::Result<()>
         ensure!(confirmed(map, &count)?, "nothing was deleted");
     }
     let deleted = client.delete(&path)?["references_deleted"].clone();
-    println!("deleted map {map} with {deleted} references");
+    say!("deleted map {map} with {deleted} references")?;
     Ok(())
 }
 
-fn confirmed(map: &MapName, references: &Value) -> io::Result<bool> {
-    print!("delete map {map} with {references} references? Type its name to go on: ");
-    io::stdout().flush()?;
+fn confirmed(map: &MapName, references: &Value) -> anyhow::Result<bool> {
+    say_part!("delete map {map} with {references} references? Type its name to go on: ")?;
     let mut line = String::new();
     io::stdin().read_line(&mut line)?;
     Ok(line.trim() == map.as_str())
@@ -162,7 +162,7 @@ fn rehead_live(client: &ServerClient, maps: &[MapName], file: Option<&[u8]>) -> 
         };
         let answer = answer.with_context(|| format!("map {map} was not given another head"))?;
         let (references, model) = (&answer["references"], answer["model"].as_str().unwrap_or_default());
-        println!("map {map}: {references} references, now {model} ({:.1} s)", begun.elapsed().as_secs_f64());
+        say!("map {map}: {references} references, now {model} ({:.1} s)", begun.elapsed().as_secs_f64())?;
     }
     Ok(())
 }
@@ -186,7 +186,7 @@ fn rehead_stopped(
     for (info, model) in plan {
         // One that is kept damaged is given again.
         if info.model == model && matches!(store.head(&info.name), Ok(Some(_))) {
-            println!("map {} has this head already: {model}", info.name);
+            say!("map {} has this head already: {model}", info.name)?;
             continue;
         }
         let style = ProgressStyle::with_template("projecting {wide_bar} {pos}/{len} {per_sec} {eta}")?;
@@ -194,7 +194,7 @@ fn rehead_stopped(
         let new = NewHead { model: model.clone(), file: Some(file.to_vec()) };
         store.replace_globals(&info.name, new, &mut Projecting { head, bar: &bar })?;
         bar.finish_and_clear();
-        println!("map {}: {} references, now {model}", info.name, info.references);
+        say!("map {}: {} references, now {model}", info.name, info.references)?;
     }
     Ok(())
 }

@@ -1,6 +1,7 @@
 //! Match two images and draw the evidence.
 
 use super::model_args::ModelOptions;
+use crate::cli::output::{OutputError, say};
 use crate::eval::evidence::{Seen, picture};
 use crate::extract::Extractor;
 use crate::image::{ImageConfig, encode_jpeg, encode_png};
@@ -49,9 +50,9 @@ pub fn run(args: MatchArgs) -> anyhow::Result<()> {
     let reranker = Reranker::new(rerank);
     let matches = reranker.explain(&query.patches, &reference.patches);
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&as_json(&query, &reference, &matches))?);
+        say!("{}", serde_json::to_string_pretty(&as_json(&query, &reference, &matches))?)?;
     } else {
-        print_counts(&query, &reference, &matches);
+        print_counts(&query, &reference, &matches)?;
     }
     if let Some(encode) = encode {
         let path = &args.out;
@@ -82,15 +83,15 @@ fn global_distance(query: &Seen, reference: &Seen) -> f32 {
     query.global.iter().zip(&reference.global).map(|(a, b)| (a - b) * (a - b)).sum::<f32>().sqrt()
 }
 
-fn print_counts(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) {
+fn print_counts(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) -> Result<(), OutputError> {
     let counts = |seen: &Seen| seen.patches.counts.map(|count| count.to_string()).join(" / ");
-    println!("key patches   {} and {}", counts(query), counts(reference));
-    println!("distance      {:.4}", global_distance(query, reference));
+    say!("key patches   {} and {}", counts(query), counts(reference))?;
+    say!("distance      {:.4}", global_distance(query, reference))?;
     for found in matches {
         let score = found.score;
-        println!("{:<13} {} inliers of {} matches", score.scales.score_name(), score.inliers, score.matches);
+        say!("{:<13} {} inliers of {} matches", score.scales.score_name(), score.inliers, score.matches)?;
     }
-    println!("S             {}", spatial_score(matches));
+    say!("S             {}", spatial_score(matches))
 }
 
 fn as_json(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) -> Value {

@@ -2,6 +2,7 @@
 
 pub mod backup;
 pub mod bench;
+mod child_server;
 mod client;
 mod data_args;
 pub mod demo;
@@ -16,6 +17,7 @@ pub mod match_images;
 pub mod model;
 pub mod model_args;
 pub mod openapi;
+pub mod output;
 pub mod query;
 pub mod serve;
 pub mod synth;

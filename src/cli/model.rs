@@ -1,5 +1,6 @@
 //! Obtain and inspect models.
 
+use crate::cli::output::say;
 use crate::extract::pull::{model_path, pull_model, resolve_model};
 use crate::extract::{ExtractConfig, ExtractError, Extractor, HeadChoice, Preset, Record, VitWeights};
 use anyhow::Context;
@@ -60,7 +61,7 @@ pub fn run(args: ModelArgs) -> anyhow::Result<()> {
     match args.command {
         ModelCommand::Pull { name, force } => {
             let path = pull_model(name, force)?;
-            println!("{name}: {}", path.display());
+            say!("{name}: {}", path.display())?;
             Ok(())
         }
         ModelCommand::Info(args) => info(args),
@@ -128,13 +129,13 @@ fn list(json: bool) -> anyhow::Result<()> {
     }
     for model in models {
         let text = |key: &str| model[key].as_str().unwrap_or("-").to_owned();
-        println!("{:20} {:62} {}", text("name"), text("summary"), text("file"));
+        say!("{:20} {:62} {}", text("name"), text("summary"), text("file"))?;
     }
     Ok(())
 }
 
 fn print_json(value: &serde_json::Value) -> anyhow::Result<()> {
-    println!("{}", serde_json::to_string_pretty(value)?);
+    say!("{}", serde_json::to_string_pretty(value)?)?;
     Ok(())
 }
 
@@ -142,8 +143,8 @@ fn print_table(report: &serde_json::Value) -> anyhow::Result<()> {
     for (key, value) in report.as_object().context("the report is an object")? {
         match value {
             serde_json::Value::Null => {}
-            serde_json::Value::String(text) => println!("{key:16} {text}"),
-            other => println!("{key:16} {other}"),
+            serde_json::Value::String(text) => say!("{key:16} {text}")?,
+            other => say!("{key:16} {other}")?,
         }
     }
     Ok(())

@@ -1,5 +1,6 @@
 //! Print the OpenAPI document.
 
+use crate::cli::output::say_part;
 use crate::http::openapi;
 use anyhow::{Context, ensure};
 use std::path::PathBuf;
@@ -30,7 +31,7 @@ pub fn run(args: OpenapiArgs) -> anyhow::Result<()> {
     match args.out {
         Some(path) => std::fs::write(&path, document).with_context(|| format!("cannot write {}", path.display())),
         None => {
-            print!("{document}");
+            say_part!("{document}")?;
             Ok(())
         }
     }

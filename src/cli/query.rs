@@ -1,6 +1,7 @@
 //! Ask a running server which place a photo shows.
 
 use super::client::{ServerArgs, ServerClient};
+use crate::cli::output::{OutputError, say};
 use crate::types::MapName;
 use serde_json::Value;
 use std::path::PathBuf;
@@ -51,16 +52,16 @@ pub fn run(args: QueryArgs) -> anyhow::Result<()> {
     parameters.extend(args.deadline_ms.map(|ms| ("deadline_ms", ms.to_string())));
     let answer = ServerClient::new(args.server)?.post_image("/query", &args.image, &parameters)?;
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&answer)?);
+        say!("{}", serde_json::to_string_pretty(&answer)?)?;
     } else {
-        print_table(&answer);
+        print_table(&answer)?;
     }
     Ok(())
 }
 
-fn print_table(answer: &Value) {
+fn print_table(answer: &Value) -> Result<(), OutputError> {
     let results = answer["results"].as_array().map(Vec::as_slice).unwrap_or_default();
-    println!("{:>4} {:>6} {:>8}  {:<22} reference", "rank", "S", "distance", "position");
+    say!("{:>4} {:>6} {:>8}  {:<22} reference", "rank", "S", "distance", "position")?;
     for result in results {
         let score = result["spatial_score"].as_u64().map_or("-".into(), |score| score.to_string());
         let position = match (result["location"]["lat"].as_f64(), result["location"]["lon"].as_f64()) {
@@ -69,18 +70,18 @@ fn print_table(answer: &Value) {
         };
         let name = result["external_id"].as_str().or(result["reference_id"].as_str()).unwrap_or_default();
         let distance = result["global_distance"].as_f64().unwrap_or_default();
-        println!("{:>4} {score:>6} {distance:>8.4}  {position:<22} {name}", result["rank"]);
+        say!("{:>4} {score:>6} {distance:>8.4}  {position:<22} {name}", result["rank"])?;
     }
     if results.is_empty() {
-        println!("nothing in this map fits");
+        say!("nothing in this map fits")?;
     }
     if let (Some(matched), Some(confidence)) = (answer["matched"].as_bool(), answer["confidence"].as_f64()) {
         let verdict = if matched { "trusted" } else { "not trusted" };
-        println!("the best answer is {verdict}: confidence {confidence:.3}");
+        say!("the best answer is {verdict}: confidence {confidence:.3}")?;
     }
     let stages = answer["timings_ms"].as_object().into_iter().flatten();
     let stages: Vec<String> =
         stages.map(|(stage, ms)| format!("{stage} {:.1}", ms.as_f64().unwrap_or_default())).collect();
     let order = if answer["reranked"] == true { "re-ranked" } else { "global ranking only" };
-    println!("{order}; milliseconds: {}", stages.join(", "));
+    say!("{order}; milliseconds: {}", stages.join(", "))
 }

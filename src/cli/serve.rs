@@ -3,6 +3,7 @@
 //! The listener is bound before anything slow begins, so that `/livez` and `/readyz` answer from the first moment;
 //! the model and the store load on a thread of their own and open the surface when they are done.
 
+use crate::cli::output::{say, say_part};
 use crate::config::{Config, Overrides};
 use crate::extract::Extractor;
 use crate::http::{AppState, serve};
@@ -45,17 +46,26 @@ pub struct Loaders {
 pub fn run(args: ServeArgs) -> anyhow::Result<()> {
     let config = Config::load(args.config.as_deref(), &args.overrides)?;
     if args.print_config {
-        print!("{}", config.to_annotated_toml()?);
+        say_part!("{}", config.to_annotated_toml()?)?;
         return Ok(());
     }
     logging::init(&config.log)?;
     crate::kernels::self_check()?;
+    let loaders = loaders(&config);
+    serve_until_signal(config, loaders)
+}
+
+/// Serves where `config` says, prints the address, and drains once the process is asked to stop.
+pub(super) fn serve_until_signal(config: Config, loaders: Loaders) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     let outcome = runtime.block_on(async {
         let listen = &config.http.listen;
         let listener = TcpListener::bind(listen).await.with_context(|| format!("cannot listen on {listen}"))?;
-        println!("listening on http://{}", listener.local_addr()?);
-        let loaders = loaders(&config);
+        let address = listener.local_addr()?;
+        // A server outlives whoever started it and read this line.
+        if let Err(error) = say!("listening on http://{address}") {
+            tracing::warn!(%error, %address, "the address was not printed");
+        }
         run_server(listener, config, loaders, async {
             if let Err(error) = shutdown::requested().await {
                 tracing::error!(%error, "signals cannot be handled; stop the process to stop the server");

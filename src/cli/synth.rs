@@ -1,5 +1,6 @@
 //! Render synthetic street scenes.
 
+use crate::cli::output::say;
 use crate::synth::{Condition, DatasetOptions, image_count, write_dataset};
 use crate::types::ImageSize;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -51,13 +52,13 @@ pub fn run(args: SynthArgs) -> anyhow::Result<()> {
     bar.set_style(ProgressStyle::with_template("rendering {wide_bar} {pos}/{len} images, {eta} left")?);
     let summary = write_dataset(&args.out, &options, || bar.inc(1))?;
     bar.finish_and_clear();
-    println!(
+    say!(
         "{}: {} references of {} places, {} queries ({} of places that are not mapped)",
         args.out.display(),
         summary.references,
         args.places,
         summary.queries,
         summary.unmatched
-    );
+    )?;
     Ok(())
 }

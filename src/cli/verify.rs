@@ -1,5 +1,6 @@
 //! Check every record of a store.
 
+use crate::cli::output::say;
 use crate::config::{Config, Overrides};
 use anyhow::{Context, ensure};
 use std::path::PathBuf;
@@ -30,18 +31,18 @@ pub fn run(args: VerifyArgs) -> anyhow::Result<()> {
         let report = serde_json::json!({
             "references": report.references, "damaged": damaged, "engine_errors": report.engine_errors,
         });
-        println!("{}", serde_json::to_string_pretty(&report)?);
+        say!("{}", serde_json::to_string_pretty(&report)?)?;
     } else {
-        println!("{} references read", report.references);
+        say!("{} references read", report.references)?;
         for (id, reason) in &report.damaged {
-            println!("damaged: {id}: {reason}");
+            say!("damaged: {id}: {reason}")?;
         }
         for error in &report.engine_errors {
-            println!("engine: {error}");
+            say!("engine: {error}")?;
         }
     }
     let found = report.damaged.len() + report.engine_errors.len();
     ensure!(found == 0, "{found} faults found; damaged references are quarantined and no longer served");
-    println!("all checksums hold");
+    say!("all checksums hold")?;
     Ok(())
 }

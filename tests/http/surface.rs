@@ -241,6 +241,17 @@ async fn request_ids_are_taken_over_or_minted() {
     assert_eq!(refused.json["request_id"], "q1");
 }
 
+/// As `placeformer openapi | head` does: the document is longer than a pipe holds, so its writer meets the closed end.
+#[test]
+fn a_command_ends_quietly_when_the_reader_of_its_output_has_gone() {
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_placeformer"));
+    command.arg("openapi").stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped());
+    let mut child = command.spawn().unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!((output.status.code(), String::from_utf8_lossy(&output.stderr).as_ref()), (Some(141), ""));
+}
+
 #[test]
 fn the_committed_openapi_document_is_current() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/openapi/openapi.json");

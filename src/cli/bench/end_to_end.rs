@@ -1,27 +1,30 @@
-//! `POST /query` through a server of this process, over loopback.
+//! `POST /query` through a server process, over loopback.
 
 use super::peers::{Measured, Peers};
 use crate::bench::filled::FilledStore;
 use crate::bench::{fill_with_streets, scenes::street, street_map};
-use crate::cli::serve::{Loaders, run_server};
+use crate::cli::child_server::ChildServer;
+use crate::cli::client::resident_bytes;
+use crate::cli::output::say;
+use crate::cli::serve::{Loaders, serve_until_signal};
 use crate::config::Config;
-use crate::extract::Extractor;
-use crate::ops::memory::resident_bytes;
+use crate::extract::{ExtractConfig, Extractor};
 use crate::store::{SqliteStore, StoreConfig};
 use crate::types::ImageSize;
 use anyhow::{Context, ensure};
 use hdrhistogram::Histogram;
 use serde::Serialize;
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
-use tokio::net::TcpListener;
-use tokio::sync::oneshot;
 
 /// Different query photos, sent in turn.
 const PHOTOS: u64 = 32;
 const PHOTO_SIZE: ImageSize = ImageSize { width: 1280, height: 720 };
+/// Where the drawn references are, within the folder of a run.
+const STORE: &str = "end-to-end";
 
 /// What to measure.
 pub(super) struct EndToEnd<'a> {
@@ -29,7 +32,7 @@ pub(super) struct EndToEnd<'a> {
     pub(super) drawn: u64,
     pub(super) clients: &'a [usize],
     pub(super) seconds: f64,
-    pub(super) extractor: Arc<Extractor>,
+    pub(super) extractor: &'a Extractor,
     pub(super) folder: &'a Path,
     /// Python with the peers' packages and the weights' file, to measure the peers too.
     pub(super) peers: Option<(&'a Path, &'a Path)>,
@@ -51,26 +54,26 @@ pub(super) struct EndToEndRow {
 
 impl EndToEnd<'_> {
     pub(super) fn measure(&self) -> anyhow::Result<Vec<EndToEndRow>> {
-        let directory = self.folder.join("end-to-end");
-        println!("drawing and describing {} references", self.drawn);
+        let directory = self.folder.join(STORE);
+        say!("drawing and describing {} references", self.drawn)?;
         let store = SqliteStore::open(&directory, &StoreConfig::default())?;
-        fill_with_streets(&store, &self.extractor, self.drawn)?;
+        fill_with_streets(&store, self.extractor, self.drawn)?;
         drop(store);
         let photos: Vec<Vec<u8>> =
             (0..PHOTOS).map(|place| street(place * 7, 1, PHOTO_SIZE)).collect::<Result<_, _>>()?;
         let photos: Arc<[bytes::Bytes]> = photos.into_iter().map(bytes::Bytes::from).collect();
         let prepare = |(python, weights)| {
             let drawn = (self.drawn, crate::bench::REFERENCE_SIZE);
-            Peers::prepare(python, self.folder, (&self.extractor, weights), drawn, &photos)
+            Peers::prepare(python, self.folder, (self.extractor, weights), drawn, &photos)
         };
         let peers = self.peers.map(prepare).transpose()?;
         let runtime = tokio::runtime::Runtime::new()?;
         let mut rows: Vec<EndToEndRow> = Vec::new();
         for &references in self.references {
             ensure!(references >= self.drawn, "--references {references} are fewer than --drawn {}", self.drawn);
-            let mut measured = runtime.block_on(self.at(references, &directory, &photos))?;
+            let mut measured = self.at(references, &runtime, &photos)?;
             if let (Some(peers), Some(row)) = (&peers, measured.first_mut()) {
-                println!("{references} references, the peers");
+                say!("{references} references, the peers")?;
                 row.peer = Some(peers.measure(references, self.seconds)?);
             }
             rows.extend(measured);
@@ -79,51 +82,52 @@ impl EndToEnd<'_> {
     }
 
     /// All numbers of clients on one server.
-    async fn at(
+    fn at(
         &self,
         references: u64,
-        directory: &Path,
+        runtime: &tokio::runtime::Runtime,
         photos: &Arc<[bytes::Bytes]>,
     ) -> anyhow::Result<Vec<EndToEndRow>> {
-        let listener = TcpListener::bind("127.0.0.1:0").await?;
-        let url = format!("http://{}", listener.local_addr()?);
-        let (stop, stopped) = oneshot::channel::<()>();
-        let (extra, directory, extractor) =
-            (references - self.drawn, directory.to_owned(), Arc::clone(&self.extractor));
-        let loaders = Loaders {
-            source: Box::new(move || Ok(extractor)),
-            store: Box::new(move || {
-                Ok(Arc::new(FilledStore::new(SqliteStore::open(&directory, &StoreConfig::default())?, extra)?))
-            }),
-        };
-        let serving = tokio::spawn(run_server(listener, Config::default(), loaders, async {
-            let _ = stopped.await;
-        }));
+        let extra = (references - self.drawn).to_string();
+        let folder = self.folder.as_os_str().to_owned();
+        // The same arguments, so that the model is the same.
+        let same = std::env::args_os().skip(1);
+        let serve = [OsString::from("--serve-filled"), extra.into(), "--folder-of-filled".into(), folder];
+        let server = ChildServer::start(same.chain(serve), self.folder.join("server.log"))?;
         let client = reqwest::Client::builder().timeout(Duration::from_secs(60)).build()?;
-        wait_until_ready(&client, &url).await?;
         let mut rows = Vec::new();
         for &clients in self.clients {
-            println!("{references} references, {clients} clients");
-            let asked = ask(&client, &url, photos, clients, Duration::from_secs_f64(self.seconds)).await?;
-            rows.push(asked.row(references, clients));
+            say!("{references} references, {clients} clients")?;
+            let time = Duration::from_secs_f64(self.seconds);
+            let (asked, resident) = runtime.block_on(async {
+                let asked = ask(&client, server.url(), photos, clients, time).await?;
+                let metrics = client.get(format!("{}/metrics", server.url())).send().await?.text().await?;
+                anyhow::Ok((asked, resident_bytes(&metrics).context("the server does not tell its memory")?))
+            })?;
+            rows.push(asked.row(references, clients, resident));
         }
-        // The server may have ended with an error, which the next line tells.
-        let _ = stop.send(());
-        serving.await.context("the server panicked")??;
+        server.stop()?;
         Ok(rows)
     }
 }
 
-async fn wait_until_ready(client: &reqwest::Client, url: &str) -> anyhow::Result<()> {
-    let started = Instant::now();
-    loop {
-        let answer = client.get(format!("{url}/readyz")).send().await;
-        if answer.as_ref().is_ok_and(|answer| answer.status().is_success()) {
-            return Ok(());
-        }
-        ensure!(started.elapsed() < Duration::from_secs(300), "the server is not ready: {answer:?}");
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
+/// What the server process of a measurement does: serves the drawn references in `folder` and `extra` made-up ones.
+pub(super) fn serve_filled(folder: &Path, extra: u64, extract: ExtractConfig) -> anyhow::Result<()> {
+    let directory = folder.join(STORE);
+    let mut config = Config::default();
+    config.data.directory.clone_from(&directory);
+    config.http.listen = "127.0.0.1:0".into();
+    let loaders = Loaders {
+        source: Box::new(move || {
+            let extractor = Extractor::open(&extract)?;
+            extractor.warm_up()?;
+            Ok(Arc::new(extractor))
+        }),
+        store: Box::new(move || {
+            Ok(Arc::new(FilledStore::new(SqliteStore::open(&directory, &StoreConfig::default())?, extra)?))
+        }),
+    };
+    serve_until_signal(config, loaders)
 }
 
 /// Answers of one measurement.
@@ -156,7 +160,7 @@ impl Asked {
         Ok(())
     }
 
-    fn row(&self, references: u64, clients: usize) -> EndToEndRow {
+    fn row(&self, references: u64, clients: usize, resident_bytes: u64) -> EndToEndRow {
         let at = |histogram: &Histogram<u64>, quantile| histogram.value_at_quantile(quantile) as f64 / 1e3;
         let ours = Measured {
             queries: self.latency.len(),
@@ -164,7 +168,7 @@ impl Asked {
             p99_ms: at(&self.latency, 0.99),
             queries_per_second: self.latency.len() as f64 / self.elapsed.as_secs_f64(),
             stages_ms: self.stages.iter().map(|(stage, times)| (stage.clone(), at(times, 0.5))).collect(),
-            resident_bytes: resident_bytes().unwrap_or_default(),
+            resident_bytes,
         };
         EndToEndRow { references, clients, ours, peer: None }
     }

@@ -6,6 +6,7 @@ mod table;
 
 use super::model_args::ModelOptions;
 use crate::bench::{Bench, BenchError, Limits, NAMES, Row};
+use crate::cli::output::say;
 use crate::extract::pull::resolve_weights;
 use crate::extract::{ExtractError, Extractor, VitWeights};
 use crate::kernels;
@@ -51,6 +52,11 @@ pub struct BenchArgs {
     /// Keep the drawn references here, to measure again sooner; a temporary folder otherwise.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
+    /// Serve what --end-to-end drew in --folder-of-filled, and this many made-up references: how it starts its server.
+    #[arg(long, hide = true, value_name = "N", requires = "folder_of_filled")]
+    serve_filled: Option<u64>,
+    #[arg(long, hide = true, value_name = "DIR")]
+    folder_of_filled: Option<PathBuf>,
     #[command(flatten)]
     model: ModelOptions,
 }
@@ -70,6 +76,9 @@ struct Report {
 
 /// Runs it.
 pub fn run(args: BenchArgs) -> anyhow::Result<()> {
+    if let (Some(extra), Some(folder)) = (args.serve_filled, &args.folder_of_filled) {
+        return end_to_end::serve_filled(folder, extra, args.model.extract_config()?);
+    }
     if cfg!(debug_assertions) {
         eprintln!("warning: this is a development build; its times mean nothing (cargo build --release)");
     }
@@ -89,28 +98,30 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
         rows: Vec::new(),
         end_to_end: Vec::new(),
     };
-    println!("{}", table::machine(&report));
+    say!("{}", table::machine(&report))?;
     if args.end_to_end {
         let plan = EndToEnd {
             references: &args.references,
             drawn: args.drawn,
             clients: &args.clients,
             seconds: args.seconds,
-            extractor,
+            extractor: &extractor,
             folder: &folder,
             peers: args.peers.as_deref().map(|python| (python, path.as_path())),
         };
         report.end_to_end = plan.measure()?;
-        println!("{}", table::end_to_end(&report.end_to_end));
     } else {
         let spec = config.encoder_spec()?;
         let bench = Bench { extractor, weights, spec, limits, folder, rounds: args.rounds as usize };
         report.rows = rows(&bench, &args.only)?;
-        println!("{}", table::rows(&report.rows));
     }
     if let Some(path) = &args.json {
         std::fs::write(path, serde_json::to_vec_pretty(&report)?)
             .with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    match args.end_to_end {
+        true => say!("{}", table::end_to_end(&report.end_to_end))?,
+        false => say!("{}", table::rows(&report.rows))?,
     }
     Ok(())
 }

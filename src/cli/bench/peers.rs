@@ -22,7 +22,7 @@ pub(super) struct Measured {
     pub(super) queries_per_second: f64,
     /// Median of each stage.
     pub(super) stages_ms: BTreeMap<String, f64>,
-    /// Resident memory: ours of server and clients together at the end, the script's at its highest.
+    /// Resident memory: of our server at the end, of the script at its highest.
     pub(super) resident_bytes: u64,
 }
 

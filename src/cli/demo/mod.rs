@@ -5,15 +5,16 @@
 //! commands and its HTTP surface, so a demo that works is a product that works.
 
 mod report;
-mod server;
 
 use super::client::{ServerArgs, ServerClient};
+use crate::cli::child_server::ChildServer;
+use crate::cli::output::say;
 use crate::extract::{ExtractConfig, pull::resolve_weights};
 use anyhow::{Context, bail, ensure};
 use report::{Asked, Evidence};
 use serde_json::Value;
-use server::DemoServer;
 use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Instant;
@@ -50,37 +51,40 @@ pub fn run(args: DemoArgs) -> anyhow::Result<()> {
     prepare(&args.out)?;
     resolve_weights(&ExtractConfig::default()).context("the demo needs the default model")?;
 
-    println!("\n1. Draw a town of {} places, {} photos each", args.places, args.views);
+    say!("\n1. Draw a town of {} places, {} photos each", args.places, args.views)?;
     let (places, views, seed) = (args.places.to_string(), args.views.to_string(), args.seed.to_string());
     let options = ["--places", &places, "--views", &views, "--seed", &seed];
     placeformer(&[&["synth", "--out", text(&town)?], &options[..]].concat())?;
 
-    println!("\n2. Start the server");
-    let server = DemoServer::start(&args.out)?;
-    println!("   ready at {}", server.url());
+    say!("\n2. Start the server")?;
+    let data = args.out.join("data");
+    say!("   $ placeformer serve --listen 127.0.0.1:0 --data {}", data.display())?;
+    let arguments = ["serve", "--listen", "127.0.0.1:0", "--data"].map(OsString::from).into_iter();
+    let server = ChildServer::start(arguments.chain([data.into()]), args.out.join("server.log"))?;
+    say!("   ready at {}", server.url())?;
 
-    println!("\n3. Import the photos into the map {MAP:?}");
+    say!("\n3. Import the photos into the map {MAP:?}")?;
     let started = Instant::now();
     let database = town.join("database");
     placeformer(&["import", text(&database)?, "--map", MAP, "--server", server.url()])?;
     let import_seconds = started.elapsed().as_secs_f64();
 
-    println!("\n4. Ask where each query photo was taken");
+    say!("\n4. Ask where each query photo was taken")?;
     let client = ServerClient::new(ServerArgs { server: server.url().into(), api_key: None, timeout: 60 })?;
     let truth = read_truth(&town.join("ground_truth.csv"))?;
     let asked = ask_all(&client, &town.join("queries"), &truth)?;
-    report::print_table(&asked);
+    report::print_table(&asked)?;
 
-    println!("\n5. Picture the evidence");
+    say!("\n5. Picture the evidence")?;
     let evidence = picture(&town, &args.out, &asked, args.pictures)?;
     let info = client.get("/info")?;
     server.stop()?;
     let path = args.out.join("index.html");
     report::write(&path, &town, &asked, &evidence, &info, import_seconds)?;
 
-    println!("\n{}", report::summary(&asked));
-    println!("report: {}", path.display());
-    println!("ask more:  placeformer serve --data {}", args.out.join("data").display());
+    say!("\n{}", report::summary(&asked))?;
+    say!("report: {}", path.display())?;
+    say!("ask more:  placeformer serve --data {}", args.out.join("data").display())?;
     Ok(())
 }
 
@@ -103,7 +107,7 @@ fn prepare(out: &Path) -> anyhow::Result<()> {
 
 /// Runs a subcommand of this program as a user would, and shows it.
 fn placeformer(arguments: &[&str]) -> anyhow::Result<()> {
-    println!("   $ placeformer {}", arguments.join(" "));
+    say!("   $ placeformer {}", arguments.join(" "))?;
     let program = std::env::current_exe().context("cannot find this program's own file")?;
     let status = Command::new(program).args(arguments).status().context("cannot start a subcommand")?;
     ensure!(status.success(), "placeformer {} failed", arguments.first().copied().unwrap_or_default());

@@ -1,5 +1,6 @@
 //! What the demo showed: a table on the terminal, a page with pictures.
 
+use crate::cli::output::{OutputError, say};
 use crate::draw::{jpeg_data_uri, thumbnail};
 use crate::eval::datasets::UtmName;
 use crate::eval::report::{escape, page, table};
@@ -95,15 +96,21 @@ impl Asked {
 }
 
 /// A line per query.
-pub(super) fn print_table(asked: &[Asked]) {
-    println!(
+pub(super) fn print_table(asked: &[Asked]) -> Result<(), OutputError> {
+    say!(
         "   {:<12} {:<14} {:>5} {:>6} {:>9} {:>8} {:>8}  verdict",
-        "query", "best reference", "S", "sure", "extract", "search", "re-rank"
-    );
+        "query",
+        "best reference",
+        "S",
+        "sure",
+        "extract",
+        "search",
+        "re-rank"
+    )?;
     for one in asked {
         let best = one.results.first().map_or("-".into(), |best| place_and_view(&best.reference));
         let stage = |name: &str| one.stages.get(name).copied().unwrap_or_default();
-        println!(
+        say!(
             "   {:<12} {best:<14} {:>5} {:>6} {:>6.0} ms {:>5.2} ms {:>5.0} ms  {}",
             place_and_view(&one.query),
             one.best_score(),
@@ -112,8 +119,9 @@ pub(super) fn print_table(asked: &[Asked]) {
             stage("search"),
             stage("load") + stage("rerank"),
             one.verdict()
-        );
+        )?;
     }
+    Ok(())
 }
 
 /// The part of a photo's name that tells it apart, for a terminal's width: place and view.

@@ -3,6 +3,7 @@
 use super::{CacheArgs, DataArgs, Described, RerankArgs, write};
 use crate::cli::client::{ServerArgs, ServerClient};
 use crate::cli::model_args::ModelOptions;
+use crate::cli::output::say_part;
 use crate::eval::calibrate::{BestAnswers, LeaveOut, OwnPlaces, Purpose, calibrate};
 use crate::eval::features::GlobalKind;
 use crate::types::{Calibration, MapName};
@@ -82,7 +83,7 @@ pub(super) fn run(args: CalibrateArgs) -> anyhow::Result<()> {
             seed: args.fit.seed,
         },
     )?;
-    print!("{}", fitted.text());
+    say_part!("{}", fitted.text())?;
     if let Some(path) = &args.output.out {
         write(path, &(serde_json::to_string_pretty(&fitted.calibration)? + "\n"))?;
     }

@@ -4,6 +4,7 @@ mod calibrate;
 
 use super::data_args::ReadArgs;
 use super::model_args::ModelOptions;
+use crate::cli::output::say_part;
 use crate::eval::ablate::{Base, ablate};
 use crate::eval::calibrate::{LeaveOut, OwnPlaces};
 use crate::eval::datasets::{self, Dataset, DatasetKind, DatasetOptions};
@@ -193,7 +194,7 @@ fn run_measure(args: MeasureArgs) -> anyhow::Result<()> {
     let dataset = args.data.load()?;
     let extract = args.model.extract_config()?;
     let measured = measure(&args, &dataset, &extract)?;
-    print!("{}", report::text(&measured.summary));
+    say_part!("{}", report::text(&measured.summary))?;
     if let Some(path) = &args.output.predictions {
         write_predictions(path, &args, &dataset, &measured.answered.answers)?;
     }
@@ -201,7 +202,7 @@ fn run_measure(args: MeasureArgs) -> anyhow::Result<()> {
     let mut json = serde_json::to_value(&measured.summary)?;
     if args.method.ablate {
         let rows = run_ablation(&args, &dataset, &extract)?;
-        print!("\n{}", report::ablation_text(&rows));
+        say_part!("\n{}", report::ablation_text(&rows))?;
         details += &report::ablation_html(&rows);
         json["ablation"] = serde_json::to_value(&rows)?;
     }

@@ -11,6 +11,7 @@ mod sink;
 mod store_sink;
 mod verdict;
 
+use crate::cli::output::say;
 use crate::config::ModelOverrides;
 use crate::eval::datasets::{UtmZone, list_images};
 use crate::types::{ContentHash, ExternalId, MapName};
@@ -90,7 +91,7 @@ pub fn run(args: ImportArgs) -> anyhow::Result<()> {
     let stopped = import.run(&images, args.concurrency, &progress);
     progress.finish_and_clear();
     let summary = log.finish()?;
-    println!("{summary}");
+    say!("{summary}")?;
     if let Some(reason) = stopped {
         bail!("stopped: {reason}");
     }

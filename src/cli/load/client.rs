@@ -1,5 +1,6 @@
 //! One request and what became of it; the server's memory while the load runs.
 
+use crate::cli::client::resident_bytes;
 use anyhow::{Context, ensure};
 use bytes::Bytes;
 use reqwest::StatusCode;
@@ -107,22 +108,5 @@ pub(super) async fn watch_memory(target: Arc<Target>, every: Duration) {
             target.memory.lock().unwrap_or_else(PoisonError::into_inner).push(bytes);
         }
         tokio::time::sleep(every).await;
-    }
-}
-
-fn resident_bytes(metrics: &str) -> Option<u64> {
-    let line = metrics.lines().find(|line| line.starts_with("process_resident_memory_bytes "))?;
-    line.split_whitespace().nth(1)?.parse::<f64>().ok().map(|bytes| bytes as u64)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn resident_memory_is_read_from_the_exposition_format() {
-        let text = "# TYPE process_resident_memory_bytes gauge\nprocess_resident_memory_bytes 123456789\n";
-        assert_eq!(resident_bytes(text), Some(123_456_789));
-        assert_eq!(resident_bytes("something_else 1\n"), None);
     }
 }

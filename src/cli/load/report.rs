@@ -91,6 +91,8 @@ pub(super) struct Report {
     pub(super) rejected_ms: Latency,
     /// The server's resident memory: at the start, highest, at the end.
     pub(super) resident_bytes: Option<[u64; 3]>,
+    /// Its highest of the second half less its highest of the first: what a leak would grow, and warming up would not.
+    pub(super) resident_growth_bytes: Option<i64>,
     /// What the failures said, with their number.
     pub(super) failures: BTreeMap<String, u64>,
 }
@@ -101,6 +103,8 @@ impl Report {
             (Some(&first), Some(&peak), Some(&last)) => Some([first, peak, last]),
             _ => None,
         };
+        let (first, second) = memory.split_at(memory.len() / 2);
+        let highest = |half: &[u64]| half.iter().max().map(|&bytes| bytes as i64);
         Self {
             rate,
             capacity,
@@ -113,9 +117,60 @@ impl Report {
             admitted_ms: Latency::from(&tally.admitted),
             rejected_ms: Latency::from(&tally.rejected),
             resident_bytes,
+            resident_growth_bytes: highest(second).zip(highest(first)).map(|(second, first)| second - first),
             failures: tally.failures,
         }
     }
+}
+
+/// What a run must keep to. Every rejection must carry Retry-After, and nothing may fail, in any case.
+#[derive(Debug, Default, clap::Args)]
+pub(super) struct Bounds {
+    /// Fail if the 99th percentile of answered queries is above this.
+    #[arg(long, value_name = "MS")]
+    pub(super) max_p99_ms: Option<f64>,
+    /// Fail if the server's highest resident memory of the second half is more above that of the first.
+    #[arg(long, value_name = "MIB")]
+    pub(super) max_growth_mib: Option<f64>,
+    /// Fail if fewer queries than this are answered per second.
+    #[arg(long, value_name = "RATE")]
+    pub(super) min_admitted_rate: Option<f64>,
+}
+
+impl Bounds {
+    /// What the run broke, in words; nothing if it kept to everything.
+    pub(super) fn broken_by(&self, report: &Report) -> Vec<String> {
+        let mut broken = Vec::new();
+        if report.rejected_without_retry_after > 0 {
+            broken.push(format!("{} rejections carried no Retry-After", report.rejected_without_retry_after));
+        }
+        if report.failed > 0 {
+            broken.push(format!("{} requests failed with neither an answer nor a rejection", report.failed));
+        }
+        if let Some(bound) = self.max_p99_ms
+            && report.admitted_ms.p99 > bound
+        {
+            broken.push(format!("the 99th percentile is {:.0} ms, above {bound} ms", report.admitted_ms.p99));
+        }
+        let rate = report.admitted as f64 / report.duration;
+        if let Some(bound) = self.min_admitted_rate
+            && rate < bound
+        {
+            broken.push(format!("{rate:.2} queries were answered per second, fewer than {bound}"));
+        }
+        match (self.max_growth_mib, report.resident_growth_bytes.map(mebibytes)) {
+            (Some(bound), Some(growth)) if growth > bound => {
+                broken.push(format!("the server's memory grew by {growth:.0} MiB, more than {bound} MiB"));
+            }
+            (Some(_), None) => broken.push("the server's memory could not be read, so its growth is not known".into()),
+            _ => {}
+        }
+        broken
+    }
+}
+
+fn mebibytes(bytes: i64) -> f64 {
+    bytes as f64 / f64::from(1 << 20)
 }
 
 impl fmt::Display for Report {
@@ -136,7 +191,7 @@ impl fmt::Display for Report {
             )?;
         }
         if let Some([first, peak, last]) = self.resident_bytes {
-            let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+            let mib = |bytes: u64| mebibytes(bytes as i64);
             writeln!(
                 f,
                 "resident   {:.0} MiB at the start, {:.0} highest, {:.0} at the end",
@@ -144,6 +199,9 @@ impl fmt::Display for Report {
                 mib(peak),
                 mib(last)
             )?;
+        }
+        if let Some(growth) = self.resident_growth_bytes {
+            writeln!(f, "growth     {:+.1} MiB from the first half to the second", mebibytes(growth))?;
         }
         for (reason, count) in &self.failures {
             writeln!(f, "  {count} x {reason}")?;
@@ -169,5 +227,22 @@ mod tests {
         assert_eq!((report.admitted, report.rejected, report.failed, report.not_sent), (2, 2, 1, 1));
         assert_eq!((report.rejected_without_retry_after, report.resident_bytes), (1, Some([5, 9, 7])));
         assert!((report.admitted_ms.max - 30.0).abs() < 0.1);
+        assert_eq!(report.resident_growth_bytes, Some(4));
+    }
+
+    #[test]
+    fn a_broken_bound_is_told_and_a_kept_one_is_not() {
+        let report = |memory| {
+            let mut tally = Tally::default();
+            tally.add(Duration::from_millis(100), Outcome::Admitted);
+            Report::new(1.0, None, 1.0, tally, memory)
+        };
+        let mebi = |count: u64| count << 20;
+        let kept = Bounds { max_p99_ms: Some(110.0), max_growth_mib: Some(8.0), min_admitted_rate: Some(0.9) };
+        assert_eq!(kept.broken_by(&report(vec![mebi(10), mebi(50), mebi(40), mebi(58)])), Vec::<String>::new());
+        let broken = Bounds { max_p99_ms: Some(90.0), max_growth_mib: Some(7.0), min_admitted_rate: Some(1.1) };
+        assert_eq!(broken.broken_by(&report(vec![mebi(10), mebi(50), mebi(40), mebi(58)])).len(), 3);
+        let unknown = broken.broken_by(&report(Vec::new()));
+        assert!(unknown.iter().any(|reason| reason.contains("could not be read")), "{unknown:?}");
     }
 }

@@ -2,6 +2,7 @@
 
 use super::head::{Source, fit};
 use super::{RunArgs, bar, facts, finish, notes, show};
+use crate::cli::output::say;
 use crate::extract::pull::resolve_weights;
 use crate::extract::{Aggregate, ExtractConfig, Extractor, Head, HeadChoice, VitWeights};
 use crate::image::ImageConfig;
@@ -49,7 +50,7 @@ pub(super) fn train(args: &RunArgs, blocks: TrainableBlocks, augmentation: Augme
     };
     let began = format!("{} with head {}", start.backbone(), extract.head);
     finish(&args.out, &facts(args, &trained, &sides.description, &began), &config, &outcome)?;
-    println!("{}", path.display());
+    say!("{}", path.display())?;
     Ok(())
 }
 

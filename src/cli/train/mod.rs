@@ -8,6 +8,7 @@ mod data;
 mod head;
 
 use super::model_args::ModelOptions;
+use crate::cli::output::say;
 use crate::train::{Augmentation, Outcome, Progress, Schedule, TrainConfig, TrainableBlocks, read_log, report};
 use anyhow::{Context, ensure};
 use clap::Args;
@@ -256,10 +257,10 @@ fn finish(folder: &Path, facts: &[(String, String)], config: &TrainConfig, outco
     let path = folder.join("report.html");
     std::fs::write(&path, report::html(facts, config, &read_log(folder)?, outcome))
         .with_context(|| format!("cannot write {}", path.display()))?;
-    println!("{}", report::verdict(outcome));
+    say!("{}", report::verdict(outcome))?;
     for (name, recall) in [("before", &outcome.initial), ("kept", &outcome.best)] {
-        println!("{name:7} R@1 {:5.1}  R@5 {:5.1}  R@10 {:5.1}", recall.at_1, recall.at_5, recall.at_10);
+        say!("{name:7} R@1 {:5.1}  R@5 {:5.1}  R@10 {:5.1}", recall.at_1, recall.at_5, recall.at_10)?;
     }
-    println!("{}", folder.join("head.safetensors").display());
+    say!("{}", folder.join("head.safetensors").display())?;
     Ok(())
 }

@@ -1,36 +1,34 @@
-//! The demo's own server process.
+//! A server process of a command's own.
 
-use crate::cli::client::{ServerArgs, ServerClient};
+use super::client::{ServerArgs, ServerClient};
 use anyhow::{Context, bail, ensure};
+use std::ffi::OsString;
 use std::fs::File;
 use std::io::{BufRead, BufReader};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Longest wait for readiness: building indexes of a demo takes moments, loading a model seconds.
-const START_LIMIT: Duration = Duration::from_secs(120);
+/// Longest wait for readiness: loading a model takes seconds, building the index of millions a minute.
+const START_LIMIT: Duration = Duration::from_secs(300);
 /// Longest wait for a drain.
 const STOP_LIMIT: Duration = Duration::from_secs(30);
 
-/// A running server on a free loopback port; killed if the demo fails.
-pub(super) struct DemoServer {
+/// A running server; killed when dropped.
+pub(super) struct ChildServer {
     child: Child,
     url: String,
     log: PathBuf,
 }
 
-impl DemoServer {
-    /// Starts `serve` on a store below `out` and waits until it is ready.
-    pub(super) fn start(out: &Path) -> anyhow::Result<Self> {
-        let log = out.join("server.log");
+impl ChildServer {
+    /// Runs this program with arguments that make it serve on a free loopback port, and waits until it is ready. What it
+    /// says goes to `log`.
+    pub(super) fn start(arguments: impl IntoIterator<Item = OsString>, log: PathBuf) -> anyhow::Result<Self> {
         let log_file = File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
         let program = std::env::current_exe().context("cannot find this program's own file")?;
-        let data = out.join("data");
-        println!("   $ placeformer serve --listen 127.0.0.1:0 --data {}", data.display());
         let mut child = Command::new(program)
-            .args(["serve", "--listen", "127.0.0.1:0", "--data"])
-            .arg(&data)
+            .args(arguments)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(log_file)
@@ -82,7 +80,7 @@ impl DemoServer {
     }
 }
 
-impl Drop for DemoServer {
+impl Drop for ChildServer {
     fn drop(&mut self) {
         // Already stopped in the good case; then there is nothing to kill and the error says only that.
         let _ = self.child.kill();
