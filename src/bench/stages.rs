@@ -326,7 +326,12 @@ pub fn street_map() -> MapName {
 pub fn fill_with_streets(store: &SqliteStore, extractor: &Extractor, count: u64) -> Result<(), BenchError> {
     const BATCH: u64 = 8;
     let map = street_map();
-    let there = store.maps()?.into_iter().find(|info| info.name == map).map_or(0, |info| info.references);
+    let there = match store.maps()?.into_iter().find(|info| info.name == map) {
+        Some(info) if info.model == *extractor.model_id() => info.references,
+        // Of a model that was measured before.
+        Some(_) => store.delete_map(&map).map(|_| 0)?,
+        None => 0,
+    };
     for from in (there..count).step_by(BATCH as usize) {
         let photos = (from..count.min(from + BATCH))
             .into_par_iter()

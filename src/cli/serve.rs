@@ -5,7 +5,7 @@
 
 use crate::cli::output::{say, say_part};
 use crate::config::{Config, Overrides};
-use crate::extract::Extractor;
+use crate::extract::{ExtractConfig, Extractor};
 use crate::http::{AppState, serve};
 use crate::ops::{Health, Metrics, disk, logging, shutdown};
 use crate::pipeline::{DescriptorSource, Parts, Service};
@@ -81,14 +81,14 @@ pub(super) fn serve_until_signal(config: Config, loaders: Loaders) -> anyhow::Re
 
 fn loaders(config: &Config) -> Loaders {
     let (extract, data, store) = (config.extract.clone(), config.data.directory.clone(), config.store.clone());
-    Loaders {
-        source: Box::new(move || {
-            let extractor = Extractor::open(&extract)?;
-            extractor.warm_up()?;
-            Ok(Arc::new(extractor))
-        }),
-        store: Box::new(move || open_store(&data, &store)),
-    }
+    Loaders { source: Box::new(move || open_model(&extract)), store: Box::new(move || open_store(&data, &store)) }
+}
+
+/// The model, after its first image.
+pub(super) fn open_model(config: &ExtractConfig) -> anyhow::Result<Arc<dyn DescriptorSource>> {
+    let extractor = Extractor::open(config)?;
+    extractor.warm_up()?;
+    Ok(Arc::new(extractor))
 }
 
 pub(super) fn open_store(data: &Path, config: &StoreConfig) -> anyhow::Result<Arc<dyn PlaceStore>> {

@@ -6,7 +6,7 @@ use crate::bench::{fill_with_streets, scenes::street, street_map};
 use crate::cli::child_server::ChildServer;
 use crate::cli::client::resident_bytes;
 use crate::cli::output::say;
-use crate::cli::serve::{Loaders, serve_until_signal};
+use crate::cli::serve::{Loaders, open_model, serve_until_signal};
 use crate::config::Config;
 use crate::extract::{ExtractConfig, Extractor};
 use crate::store::{SqliteStore, StoreConfig};
@@ -118,11 +118,7 @@ pub(super) fn serve_filled(folder: &Path, extra: u64, extract: ExtractConfig) ->
     config.data.directory.clone_from(&directory);
     config.http.listen = "127.0.0.1:0".into();
     let loaders = Loaders {
-        source: Box::new(move || {
-            let extractor = Extractor::open(&extract)?;
-            extractor.warm_up()?;
-            Ok(Arc::new(extractor))
-        }),
+        source: Box::new(move || open_model(&extract)),
         store: Box::new(move || {
             Ok(Arc::new(FilledStore::new(SqliteStore::open(&directory, &StoreConfig::default())?, extra)?))
         }),
