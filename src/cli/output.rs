@@ -9,7 +9,7 @@ use std::io::{self, Write, stdout};
 /// Standard output took no more.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
-    /// The reader of the pipe has gone: it has what it wanted, so this is no failure.
+    /// The reader of the pipe has gone, mostly because it has what it wanted.
     #[error("the reader of standard output has gone")]
     Closed,
     /// Anything else, such as a full disk.

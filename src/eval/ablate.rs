@@ -71,34 +71,40 @@ pub struct Base<'a> {
 /// Loads the model for some settings.
 pub type OpenModel<'a> = dyn Fn(&ExtractConfig) -> Result<Box<dyn Describe>, EvalError> + 'a;
 
+/// The table, and what it could not have.
+pub struct Ablation {
+    /// Rows, in the order of their axes.
+    pub rows: Vec<AblationRow>,
+    /// Rows that were left out, and why, in words.
+    pub left_out: Vec<String>,
+}
+
 /// Runs every row; `progress` shows where it stands.
 pub fn ablate(
     dataset: &Dataset,
     base: &Base<'_>,
     open: &OpenModel<'_>,
     progress: &MultiProgress,
-) -> Result<Vec<AblationRow>, EvalError> {
+) -> Result<Ablation, EvalError> {
     let variants = variants(base)?;
     let bar = progress.add(ProgressBar::new(variants.len() as u64).with_message("settings"));
-    let mut rows = Vec::new();
+    let mut table = Ablation { rows: Vec::new(), left_out: Vec::new() };
     // Neighbouring variants share their extraction, so one set of features at a time is enough.
     for group in variants.chunk_by(|a, b| a.extract == b.extract) {
         let features = Prepared::new(dataset, base, &group[0].extract, open, progress)?;
         for variant in group {
             match features.row(dataset, variant, progress)? {
-                Some(row) => rows.push(row),
+                Some(row) => table.rows.push(row),
                 None => {
-                    let text =
-                        format!("left out {} {}: its descriptors need more memory", variant.axis, variant.setting);
-                    // A line of the terminal that cannot be written is no reason to end.
-                    let _ = progress.println(text);
+                    let name = format!("{} {}", variant.axis, variant.setting);
+                    table.left_out.push(format!("{name}: its descriptors need more memory than is allowed"));
                 }
             }
             bar.inc(1);
         }
     }
     bar.finish_and_clear();
-    Ok(rows)
+    Ok(table)
 }
 
 struct Prepared {

@@ -76,13 +76,13 @@ struct Report {
 
 /// Runs it.
 pub fn run(args: BenchArgs) -> anyhow::Result<()> {
-    if let (Some(extra), Some(folder)) = (args.serve_filled, &args.folder_of_filled) {
-        return end_to_end::serve_filled(folder, extra, args.model.extract_config()?);
-    }
     if cfg!(debug_assertions) {
         eprintln!("warning: this is a development build; its times mean nothing (cargo build --release)");
     }
     let simd = kernels::self_check()?;
+    if let (Some(extra), Some(folder)) = (args.serve_filled, &args.folder_of_filled) {
+        return end_to_end::serve_filled(folder, extra, args.model.extract_config()?);
+    }
     let config = args.model.extract_config()?;
     let path = resolve_weights(&config)?;
     let weights = VitWeights::load(&path, config.preset, config.heads)?;
@@ -142,7 +142,8 @@ fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<Row>> {
             Ok(row) => rows.push(row),
             // Named rows must be measured; of all rows, those this CPU can.
             Err(BenchError::Extract(error @ ExtractError::Precision { .. })) if only.is_empty() => {
-                bar.println(format!("left out {name}: {error}"));
+                // The bar's own `println` says nothing where there is no terminal.
+                bar.suspend(|| eprintln!("left out {name}: {error}"));
             }
             Err(error) => return Err(error.into()),
         }

@@ -5,7 +5,7 @@ mod calibrate;
 use super::data_args::ReadArgs;
 use super::model_args::ModelOptions;
 use crate::cli::output::say_part;
-use crate::eval::ablate::{Base, ablate};
+use crate::eval::ablate::{Ablation, Base, ablate};
 use crate::eval::calibrate::{LeaveOut, OwnPlaces};
 use crate::eval::datasets::{self, Dataset, DatasetKind, DatasetOptions};
 use crate::eval::features::{Describe, FeatureCache, Features, GlobalKind, ModelDescriber};
@@ -201,7 +201,8 @@ fn run_measure(args: MeasureArgs) -> anyhow::Result<()> {
     let mut details = String::new();
     let mut json = serde_json::to_value(&measured.summary)?;
     if args.method.ablate {
-        let rows = run_ablation(&args, &dataset, &extract)?;
+        let Ablation { rows, left_out } = run_ablation(&args, &dataset, &extract)?;
+        left_out.iter().for_each(|row| eprintln!("left out {row} (--patch-memory)"));
         say_part!("\n{}", report::ablation_text(&rows))?;
         details += &report::ablation_html(&rows);
         json["ablation"] = serde_json::to_value(&rows)?;
@@ -406,11 +407,7 @@ fn write_predictions(path: &Path, args: &MeasureArgs, dataset: &Dataset, answers
     Ok(())
 }
 
-fn run_ablation(
-    args: &MeasureArgs,
-    dataset: &Dataset,
-    extract: &ExtractConfig,
-) -> anyhow::Result<Vec<crate::eval::ablate::AblationRow>> {
+fn run_ablation(args: &MeasureArgs, dataset: &Dataset, extract: &ExtractConfig) -> anyhow::Result<Ablation> {
     let rerank = args.method.rerank.config();
     let mut backbones = vec![extract.preset];
     backbones.extend(args.method.backbones.iter().filter(|&&preset| preset != extract.preset));

@@ -6,13 +6,13 @@
 use super::EvalError;
 use crate::eval::datasets::{Dataset, Item};
 use crate::eval::features::Describe;
-use crate::eval::run::{Answer, Candidate};
+use crate::eval::run::{Answer, Candidate, Neighbour};
 use crate::rerank::{CombinationScore, PairScore, RerankConfig, Reranker};
 use crate::types::{KeyPatches, SCALES, ScaleSet};
 use indicatif::ProgressBar;
 use nalgebra::DMatrix;
 use rayon::prelude::*;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
 /// Answers re-ranked in full precision.
@@ -33,9 +33,9 @@ pub(super) fn rerank_all(
     memory_bytes: u64,
     progress: &ProgressBar,
 ) -> Result<Option<FullPrecision>, EvalError> {
-    let candidates: BTreeMap<usize, ()> = answers.iter().flat_map(|a| &a.global).map(|n| (n.index, ())).collect();
+    let candidates: BTreeSet<usize> = answers.iter().flat_map(|answer| &answer.global).map(|n| n.index).collect();
     let (mut database, mut bytes) = (BTreeMap::new(), 0);
-    for &index in candidates.keys() {
+    for &index in &candidates {
         let whole = Whole::of(&describe(describer, &dataset.database[index])?);
         bytes += whole.bytes();
         // The first tells about all: no hours are spent on what would not fit in the end.
@@ -66,7 +66,7 @@ fn describe(describer: &dyn Describe, item: &Item) -> Result<KeyPatches, EvalErr
 
 fn rerank(reranker: &Reranker, query: &Whole, database: &BTreeMap<usize, Whole>, answer: &Answer) -> Answer {
     let rows = query.descriptors.transpose();
-    let score = |neighbour: &crate::eval::run::Neighbour| {
+    let score = |neighbour: &Neighbour| {
         let score = query.score(&rows, &database[&neighbour.index], reranker);
         Candidate { index: neighbour.index, distance: neighbour.distance, score }
     };

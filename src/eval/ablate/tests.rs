@@ -185,7 +185,8 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
     let base =
         Base { extract: &extract, rerank: &rerank, candidates: 2, backbones, cache: &cache, memory_bytes: 1 << 20 };
     let hidden = MultiProgress::with_draw_target(indicatif::ProgressDrawTarget::hidden());
-    let rows = ablate(&dataset, &base, &open, &hidden).unwrap();
+    let Ablation { rows, left_out } = ablate(&dataset, &base, &open, &hidden).unwrap();
+    assert!(left_out.is_empty(), "{left_out:?}");
     let row = |axis: &str, setting: &str| rows.iter().find(|row| row.axis == axis && row.setting == setting).unwrap();
     assert!(row("tau", "1.5").patch_bytes < row("tau", "1 *").patch_bytes);
     assert!(row("caps", "50 / 25 / 6").patch_bytes < row("caps", "200 / 100 / 25").patch_bytes + 1.0);
@@ -215,8 +216,9 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
     assert_eq!(full.recall, int8.recall);
     assert!(full.patch_bytes > 2.0 * int8.patch_bytes);
     let small = ablate(&dataset, &Base { memory_bytes: 5000, ..base }, &open, &hidden).unwrap();
-    assert_eq!(small.len() + 1, rows.len());
-    assert!(!small.iter().any(|row| row.setting == "f32"));
+    assert_eq!(small.rows.len() + 1, rows.len());
+    assert!(!small.rows.iter().any(|row| row.setting == "f32"));
+    assert_eq!(small.left_out, ["codec f32: its descriptors need more memory than is allowed"]);
     let starred: Vec<_> = rows.iter().filter(|row| row.setting.ends_with('*')).collect();
     assert_eq!(starred.len(), 7);
     assert!(starred.iter().all(|row| row.recall == starred[0].recall && row.patch_bytes == starred[0].patch_bytes));
