@@ -12,17 +12,58 @@ use super::elementwise::{exponentiate_row, scale_rows};
 use super::gemm::{Panel, Tiling, multiply_panel};
 use super::greatest_common_divisor;
 use super::operand::{Format, Rows};
+use super::simd::SimdLevel;
+use super::transpose::transpose;
 
-/// Tokens of a chunk: whole register tiles and whole key panels.
-pub fn chunk_rows(simd: Simd) -> usize {
-    let tile = Tiling::of(simd);
-    let common = tile.rows / greatest_common_divisor(tile.rows, tile.columns) * tile.columns;
-    common * (48usize.div_ceil(common))
+/// Tokens of a chunk, whole register tiles and whole key panels, where `images` of so many tokens are spread over
+/// `threads`. It changes how long they take and not what they give.
+pub fn chunk_rows(simd: Simd, tokens: usize, images: usize, threads: usize) -> usize {
+    let fewest = fewest_chunk_rows(simd);
+    if simd.level() < SimdLevel::Amx {
+        return fewest;
+    }
+    // Matrix registers are done with a chunk before the weights of the next layer are there: the fewer chunks the
+    // better, as long as every thread has as much to do.
+    let sizes = (1..=MOST_CHUNK_ROWS / fewest).rev().map(|count| count * fewest);
+    sizes.min_by_key(|&rows| finished_after(rows, tokens, images, threads.max(1))).unwrap_or(fewest)
 }
 
-/// Floats that the scores of one group of query rows may take: half of a second-level cache of 512 kB leaves room for
-/// a head's values to stream by.
-const GROUP_SCORES: usize = 40 * 1024;
+/// Some dozens of rows: enough that fetching a panel of weights does not take longer than multiplying with it in vector
+/// registers.
+fn fewest_chunk_rows(simd: Simd) -> usize {
+    let tile = Tiling::of(simd);
+    let common = tile.rows / greatest_common_divisor(tile.rows, tile.columns) * tile.columns;
+    common * 48usize.div_ceil(common)
+}
+
+/// Rows of a chunk whose tokens, packed and not, and a slice of whose hidden layer leave room for weights in a
+/// second-level cache of 2 MB; twice as many are no faster, and spread worse.
+const MOST_CHUNK_ROWS: usize = 192;
+
+/// Rows that take as long as it takes to fetch the weights they are multiplied with.
+const ROWS_OF_WEIGHTS: usize = 64;
+
+/// When the last thread is done with one layer, in units of a row, if chunks have so many rows.
+fn finished_after(rows: usize, tokens: usize, images: usize, threads: usize) -> usize {
+    let time = |rows: usize| if rows == 0 { 0 } else { rows + ROWS_OF_WEIGHTS };
+    let (whole, full, rest) = (images * (tokens / rows), time(rows), time(tokens % rows));
+    let (each, busier) = (whole / threads, whole % threads);
+    if busier == 0 {
+        return each * full + images.div_ceil(threads) * rest;
+    }
+    // What is left of the images falls to those who have a whole chunk less.
+    let fits = rest == 0 || images <= (threads - busier) * (full / rest);
+    (each + 1) * full + if fits { 0 } else { rest }
+}
+
+/// Query rows of a group at most: whole tiles of every level.
+const GROUP_ROWS: usize = 96;
+
+/// Floats that the scores of one group of query rows may take: a part of the second-level cache that leaves room for a
+/// head's values to stream by. That cache has 512 kB or more, and 2 MB where there are matrix registers.
+fn group_scores(simd: Simd) -> usize {
+    if simd.level() == SimdLevel::Amx { 80 * 1024 } else { 40 * 1024 }
+}
 
 /// How queries and keys are stored, and thereby how their products are computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -114,35 +155,47 @@ impl AttentionShape {
 
     fn group_rows(&self, simd: Simd) -> usize {
         let tile = Tiling::of(simd).rows;
-        (GROUP_SCORES / self.padded_tokens() / tile * tile).clamp(tile, self.chunk_rows)
+        (group_scores(simd) / self.padded_tokens() / tile * tile).clamp(tile, self.chunk_rows.min(GROUP_ROWS))
     }
 }
 
-/// Writes finished rows of the query projection, `columns` dimensions of one head from `dim` on and in the shape's
-/// format, to their places in `queries` (`[rows, query_len]`).
+/// Where a finished block of a projection belongs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Place {
+    /// The head.
+    pub head: usize,
+    /// Its dimension that the block's first column is.
+    pub dim: usize,
+    /// The token of the chunk that the block's first row is; whole panels of keys.
+    pub token: usize,
+}
+
+/// Writes finished rows of the query projection in the shape's format to their places in `queries`
+/// (`[chunk_rows, query_len]`).
 ///
 /// # Panics
 /// If `queries` is too short.
-pub fn store_queries(shape: &AttentionShape, head: usize, dim: usize, block: Rows<'_>, queries: &mut [u32]) {
-    let at = head * shape.head_words() + shape.score_format.words(dim);
+pub fn store_queries(shape: &AttentionShape, place: Place, block: Rows<'_>, queries: &mut [u32]) {
+    let at = place.head * shape.head_words() + shape.score_format.words(place.dim);
     for (row, words) in block.data.chunks_exact(block.stride).enumerate() {
-        queries[row * shape.query_len() + at..][..words.len()].copy_from_slice(words);
+        queries[(place.token + row) * shape.query_len() + at..][..words.len()].copy_from_slice(words);
     }
 }
 
 /// As [`store_queries`], to a chunk's keys.
 ///
 /// # Panics
-/// If `keys` is not a chunk of `shape`.
-pub fn store_keys(simd: Simd, shape: &AttentionShape, head: usize, dim: usize, block: Rows<'_>, keys: &mut [u32]) {
+/// If `keys` is not a chunk of `shape`, or the place not the first of a panel.
+pub fn store_keys(simd: Simd, shape: &AttentionShape, place: Place, block: Rows<'_>, keys: &mut [u32]) {
     let (columns, panel_len) = (Tiling::of(simd).columns, shape.head_words() * Tiling::of(simd).columns);
     assert_eq!(keys.len(), shape.keys_len(), "not one chunk of keys");
-    let head = &mut keys[head * shape.head_keys()..][..shape.head_keys()];
-    for (token, row) in block.data.chunks_exact(block.stride).enumerate() {
-        let panel = &mut head[token / columns * panel_len..][..panel_len];
-        for (offset, &word) in row.iter().enumerate() {
-            panel[(shape.score_format.words(dim) + offset) * columns + token % columns] = word;
-        }
+    assert_eq!(place.token % columns, 0, "keys are written by whole panels");
+    let first = shape.score_format.words(place.dim) * columns;
+    let head = &mut keys[place.head * shape.head_keys()..][..shape.head_keys()];
+    let panels = head.chunks_exact_mut(panel_len).skip(place.token / columns);
+    for (rows, panel) in block.data.chunks(columns * block.stride).zip(panels) {
+        let size = (rows.len() / block.stride, block.stride);
+        transpose(simd, (rows, block.stride), size, &mut panel[first..], columns);
     }
 }
 
@@ -150,11 +203,12 @@ pub fn store_keys(simd: Simd, shape: &AttentionShape, head: usize, dim: usize, b
 ///
 /// # Panics
 /// If `values` is not a chunk of `shape`.
-pub fn store_values(simd: Simd, shape: &AttentionShape, head: usize, dim: usize, block: Rows<'_>, values: &mut [u32]) {
+pub fn store_values(simd: Simd, shape: &AttentionShape, place: Place, block: Rows<'_>, values: &mut [u32]) {
     let columns = Tiling::of(simd).columns;
     assert_eq!(values.len(), shape.values_len(), "not one chunk of values");
-    let panel = head * shape.head_values() + dim / columns * shape.mix_format.words(shape.chunk_rows) * columns;
-    let panel = &mut values[panel..];
+    let words = |tokens: usize| shape.mix_format.words(tokens);
+    let row = place.dim / columns * words(shape.chunk_rows) + words(place.token);
+    let panel = &mut values[place.head * shape.head_values() + row * columns..];
     if shape.mix_format == Format::F32 {
         return panel[..block.data.len()].copy_from_slice(block.data);
     }
@@ -211,7 +265,7 @@ pub fn attend(
 ) {
     let columns = Tiling::of(simd).columns;
     let (width, group) = (shape.padded_tokens(), shape.group_rows(simd));
-    let mut reciprocals = [0.0f32; 128];
+    let mut reciprocals = [0.0f32; GROUP_ROWS];
     for first in (0..rows).step_by(group) {
         let count = group.min(rows - first);
         score(simd, shape, head, head_queries(shape, head, first, queries), count, keys, scratch);
@@ -257,7 +311,7 @@ pub fn first_row_attention(
 pub(super) fn check(simd: Simd) -> Result<(), String> {
     for formats in formats(simd) {
         for extra in 1..4 {
-            compare_with_definition(simd, formats, chunk_rows(simd) + 10 * extra + 1, 2, 32)?;
+            compare_with_definition(simd, formats, fewest_chunk_rows(simd) + 10 * extra + 1, 2, 32)?;
         }
     }
     Ok(())
@@ -301,9 +355,10 @@ fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, 
             let key = of_key.pack_scores(simd, shape.score_format, ScoreSide::Key, (filled, columns), block(1));
             let value = of_value.pack(simd, shape.mix_format, filled, columns, block(2)).rows;
             let first = chunk * shape.chunk_rows * shape.query_len();
-            store_queries(shape, head, within, query, &mut queries[first..]);
-            store_keys(simd, shape, head, within, key, &mut keys[of(shape.keys_len())]);
-            store_values(simd, shape, head, within, value, &mut values[of(shape.values_len())]);
+            let place = Place { head, dim: within, token: 0 };
+            store_queries(shape, place, query, &mut queries[first..]);
+            store_keys(simd, shape, place, key, &mut keys[of(shape.keys_len())]);
+            store_values(simd, shape, place, value, &mut values[of(shape.values_len())]);
         }
     }
     (queries, keys, values)
@@ -317,7 +372,8 @@ fn compare_with_definition(
     head_dim: usize,
 ) -> Result<(), String> {
     use super::testing::{differ, ramp};
-    let shape = AttentionShape { score_format, mix_format, tokens, heads, head_dim, chunk_rows: chunk_rows(simd) };
+    let shape =
+        AttentionShape { score_format, mix_format, tokens, heads, head_dim, chunk_rows: fewest_chunk_rows(simd) };
     let (dim, padded) = (heads * head_dim, shape.padded_tokens());
     let [query_rows, key_rows, value_rows] = [11, 12, 13].map(|seed| ramp(padded * dim, seed));
     let (queries, keys, values) = lay_out(simd, &shape, [&query_rows, &key_rows, &value_rows]);
@@ -378,5 +434,32 @@ mod tests {
                 }
             }
         }
+
+        #[test]
+        fn chunks_are_whole_panels_and_keep_every_thread_busy(
+            tokens in 1usize..3000, images in 1usize..10, threads in 1usize..33
+        ) {
+            for simd in Simd::all() {
+                let (tile, rows) = (Tiling::of(simd), chunk_rows(simd, tokens, images, threads));
+                prop_assert_eq!((rows % tile.rows, rows % tile.columns), (0, 0));
+                let fewest = fewest_chunk_rows(simd);
+                prop_assert!((fewest..=MOST_CHUNK_ROWS).contains(&rows), "{} rows", rows);
+                if simd.level() == SimdLevel::Amx {
+                    let after = |rows| finished_after(rows, tokens, images, threads);
+                    prop_assert!(after(rows) <= after(fewest));
+                }
+            }
+        }
+    }
+    #[test]
+    fn the_slowest_thread_decides_how_long_a_layer_takes() {
+        let time = |rows| rows + ROWS_OF_WEIGHTS;
+        // Four whole chunks and one of a single token; five nearly equal ones; more threads than chunks.
+        assert_eq!(finished_after(192, 769, 1, 2), 2 * time(192) + time(1));
+        assert_eq!(finished_after(160, 769, 1, 2), 2 * time(160) + time(129));
+        assert_eq!(finished_after(64, 769, 1, 16), time(64));
+        // The rests of three images beside the odd whole chunk, and too many of them.
+        assert_eq!(finished_after(64, 64 + 1, 3, 2), 2 * time(64) + time(1));
+        assert_eq!(finished_after(128, 128 + 1, 1, 2), time(128));
     }
 }

@@ -1,9 +1,9 @@
 //! What a transformer does between its matrix products: LayerNorm, softmax, and the epilogues that add bias, GELU and
 //! residual to a product while it is still in the first-level cache.
 //!
-//! `exp2` and `erf` are polynomials: 2^f on [-0.5, 0.5] of degree 5 (relative error 1e-7), and erf(x) = x P(x^2) up to
-//! 3.7, of degree 13 in x^2 mapped to [-1, 1], 1 beyond (absolute error 4e-7). Both were fitted for the smallest
-//! maximal error.
+//! `exp2` and `erf` are polynomials: 2^f on [-0.5, 0.5] of degree 5 (relative error 1e-7), or 3 (7e-5) where the result
+//! is rounded to eight bits anyway, and erf(x) = x P(x^2) up to 3.7, of degree 13 in x^2 mapped to [-1, 1], 1 beyond
+//! (absolute error 4e-7). All were fitted for the smallest maximal error.
 
 use super::Simd;
 use super::gemm::{PanelCodes, Tiling, covers};
@@ -43,61 +43,111 @@ pub struct Product<'a> {
 /// # Panics
 /// If a slice is too short.
 pub fn finish_block(simd: Simd, epilogue: Epilogue, product: Product<'_>, out: &mut [f32], out_stride: usize) {
-    let (columns, rows) = (Tiling::of(simd).columns, product.rows);
-    if rows == 0 {
+    if product.rows == 0 {
         return;
     }
-    assert!(covers(product.block.len(), rows, columns, columns), "block too short");
-    assert!(product.bias.is_none_or(|bias| bias.len() >= columns), "bias too short");
-    assert!(covers(out.len(), rows, out_stride, columns), "result too short");
-    if let Some(codes) = product.codes {
-        assert!(product.factors.len() >= rows, "factors of the rows too short");
-        assert!(codes.factors.len() >= columns && codes.offsets.len() >= columns, "factors of the columns too short");
-    }
-    let job = FinishJob { epilogue, columns, product, out: out.as_mut_ptr(), out_stride };
+    let columns = product.check(simd);
+    assert!(covers(out.len(), product.rows, out_stride, columns), "result too short");
+    let job = FinishJob { columns, product, out: out.as_mut_ptr(), out_stride };
     at_level!(
         simd,
-        (job: &FinishJob<'_> = &job),
-        job.run::<Portable>(),
-        job.run::<Avx2>(),
-        job.run::<Avx512>(),
+        (job: &FinishJob<'_, f32> = &job, epilogue: Epilogue = epilogue),
+        job.run::<Portable>(epilogue),
+        job.run::<Avx2>(epilogue),
+        job.run::<Avx512>(epilogue),
     );
 }
 
-/// The checked arguments of [`finish_block`].
-struct FinishJob<'a> {
-    epilogue: Epilogue,
+/// As [`finish_block`] with [`Epilogue::BiasGelu`], rounded to bf16, two to a word: row `i` of `out` starts at
+/// `i * out_stride` and has half as many words as the product columns.
+///
+/// # Panics
+/// If a slice is too short, or bf16 not available at this level.
+pub fn finish_gelu_bf16(simd: Simd, product: Product<'_>, out: &mut [u32], out_stride: usize) {
+    if product.rows == 0 {
+        return;
+    }
+    let columns = product.check(simd);
+    assert!(covers(out.len(), product.rows, out_stride, columns / 2), "result too short");
+    let job = FinishJob { columns, product, out: out.as_mut_ptr(), out_stride };
+    at_bf16_level!(
+        simd,
+        (job: &FinishJob<'_, u32> = &job),
+        job.run_gelu_bf16::<Portable>(),
+        job.run_gelu_bf16::<Avx2>(),
+        job.run_gelu_bf16::<Avx512>(),
+    );
+}
+
+impl Product<'_> {
+    /// Its columns, after looking at how long its slices are.
+    fn check(&self, simd: Simd) -> usize {
+        let (columns, rows) = (Tiling::of(simd).columns, self.rows);
+        assert!(covers(self.block.len(), rows, columns, columns), "block too short");
+        assert!(self.bias.is_none_or(|bias| bias.len() >= columns), "bias too short");
+        if let Some(codes) = self.codes {
+            assert!(self.factors.len() >= rows, "factors of the rows too short");
+            assert!(
+                codes.factors.len() >= columns && codes.offsets.len() >= columns,
+                "factors of the columns too short"
+            );
+        }
+        columns
+    }
+}
+
+/// The checked arguments of an epilogue, whose results are words of type `T`.
+struct FinishJob<'a, T> {
     columns: usize,
     product: Product<'a>,
-    out: *mut f32,
+    out: *mut T,
     out_stride: usize,
 }
 
-impl FinishJob<'_> {
+impl FinishJob<'_, f32> {
     #[inline(always)]
-    unsafe fn run<V: Lanes>(&self) {
-        // SAFETY: `finish_block` has checked the extents; `columns` is a multiple of every vector's length.
+    unsafe fn run<V: Lanes>(&self, epilogue: Epilogue) {
+        // SAFETY: `finish_block` has checked the extents.
         unsafe {
-            match self.epilogue {
-                Epilogue::Bias => self.each::<V>(|value, _| value),
-                Epilogue::BiasGelu => self.each::<V>(|value, _| gelu(value)),
-                Epilogue::BiasResidual => self.each::<V>(|value, out| value.add(V::load(out))),
+            let place = |row: usize, column: usize| self.out.add(row * self.out_stride + column);
+            match epilogue {
+                Epilogue::Bias => self.each::<V>(|value, row, column| value.store(place(row, column))),
+                Epilogue::BiasGelu => self.each::<V>(|value, row, column| gelu(value).store(place(row, column))),
+                Epilogue::BiasResidual => self.each::<V>(|value, row, column| {
+                    let place = place(row, column);
+                    value.add(V::load(place)).store(place);
+                }),
             }
         }
     }
+}
 
+impl FinishJob<'_, u32> {
     #[inline(always)]
-    unsafe fn each<V: Lanes>(&self, finish: impl Fn(V, *const f32) -> V) {
+    unsafe fn run_gelu_bf16<V: Lanes>(&self) {
+        // SAFETY: `finish_gelu_bf16` has checked the extents.
+        unsafe {
+            self.each::<V>(|value, row, column| {
+                gelu(value).store_bf16(self.out.add(row * self.out_stride + column / 2));
+            });
+        }
+    }
+}
+
+impl<T> FinishJob<'_, T> {
+    /// Every vector of the product with its bias, its row and its column.
+    #[inline(always)]
+    unsafe fn each<V: Lanes>(&self, finish: impl Fn(V, usize, usize)) {
         let Product { rows, block, codes, factors, bias } = self.product;
         for column in (0..self.columns).step_by(V::COUNT) {
-            // SAFETY: as in `run`; offsets are 32 bits wide like floats.
+            // SAFETY: the extents are checked, and `columns` is a multiple of every vector's length; offsets are 32
+            // bits wide like floats.
             unsafe {
                 let bias = bias.map_or(V::splat(0.0), |bias| V::load(bias.as_ptr().add(column)));
                 let codes = codes.map(|codes| {
                     (V::load(codes.factors.as_ptr().add(column)), V::load(codes.offsets.as_ptr().add(column).cast()))
                 });
                 for row in 0..rows {
-                    let out = self.out.add(row * self.out_stride + column);
                     let sum = V::load(block.as_ptr().add(row * self.columns + column));
                     let value = match codes {
                         None => sum.add(bias),
@@ -106,7 +156,7 @@ impl FinishJob<'_> {
                             sum.integer_difference(offset).mul_add(factor, bias)
                         }
                     };
-                    finish(value, out).store(out);
+                    finish(value, row, column);
                 }
             }
         }
@@ -208,8 +258,8 @@ pub fn exponentiate_row(simd: Simd, format: Format, scores: &mut [f32]) -> f32 {
 
 #[inline(always)]
 unsafe fn exponentiate<V: Lanes, const BF16: bool>(scores: &mut [f32]) -> f32 {
-    // SAFETY: whole vectors stay inside `scores`, the rest is loaded partially and stored by element or, in bf16, in
-    // half its room. Results never lie beyond the scores read so far.
+    // SAFETY: whole vectors stay inside `scores`, the rest is loaded and stored partially, in bf16 in half its room.
+    // Results never lie beyond the scores read so far.
     unsafe {
         let (start, len) = (scores.as_mut_ptr(), scores.len());
         let (pairs, whole) = (len / (2 * V::COUNT) * (2 * V::COUNT), len / V::COUNT * V::COUNT);
@@ -223,6 +273,7 @@ unsafe fn exponentiate<V: Lanes, const BF16: bool>(scores: &mut [f32]) -> f32 {
             highest[0] = highest[0].max(rest);
         }
         let highest = V::splat(highest[0].max(highest[1]).maximum());
+        let power = |value: V| exp2(value.sub(highest), if BF16 { &EXP2_SHORT } else { &EXP2 });
         let store = |value: V, at: usize| {
             if BF16 { value.store_bf16(start.cast::<u32>().add(at / 2)) } else { value.store(start.add(at)) }
         };
@@ -230,31 +281,27 @@ unsafe fn exponentiate<V: Lanes, const BF16: bool>(scores: &mut [f32]) -> f32 {
         for at in (0..pairs).step_by(2 * V::COUNT) {
             for (half, sum) in sums.iter_mut().enumerate() {
                 let at = at + half * V::COUNT;
-                let value = exp2(V::load(start.add(at)).sub(highest));
+                let value = power(V::load(start.add(at)));
                 store(value, at);
                 *sum = sum.add(value);
             }
         }
         if pairs < whole {
-            let value = exp2(V::load(start.add(pairs)).sub(highest));
+            let value = power(V::load(start.add(pairs)));
             store(value, pairs);
             sums[0] = sums[0].add(value);
         }
-        let mut total = sums[0].add(sums[1]).sum();
         if whole < len {
-            let (mut rest, count) = ([0.0f32; 16], len - whole);
-            exp2(V::load_partial(start.add(whole), count, 0.0).sub(highest)).store(rest.as_mut_ptr());
-            rest[count..].fill(0.0);
-            total += rest[..count].iter().sum::<f32>();
+            let count = len - whole;
+            let value = power(V::load_partial(start.add(whole), count, 0.0)).first(count);
+            sums[1] = sums[1].add(value);
             if BF16 {
-                let mut words = [0u32; 8];
-                V::load(rest.as_ptr()).store_bf16(words.as_mut_ptr());
-                std::ptr::copy_nonoverlapping(words.as_ptr(), start.cast::<u32>().add(whole / 2), count.div_ceil(2));
+                value.store_bf16_partial(start.cast::<u32>().add(whole / 2), count);
             } else {
-                std::ptr::copy_nonoverlapping(rest.as_ptr(), start.add(whole), count);
+                value.store_partial(start.add(whole), count);
             }
         }
-        1.0 / total
+        1.0 / sums[0].add(sums[1]).sum()
     }
 }
 
@@ -268,17 +315,20 @@ pub fn scale_rows(factors: &[f32], columns: usize, out: &mut [f32], stride: usiz
     }
 }
 
-/// 2^x for x in [-126, 127]; smaller x give 2^-126, NaN stays NaN.
+/// 2^f on [-0.5, 0.5], highest power first.
+const EXP2: [f32; 6] = [0.001_327_647, 0.009_675_541, 0.055_507_135, 0.240_221_2, 0.693_146_94, 1.000_000_1];
+
+/// The same for results that are rounded to eight bits.
+const EXP2_SHORT: [f32; 4] = [0.055_171_67, 0.242_611_13, 0.693_260_97, 0.999_928_06];
+
+/// 2^x for x up to 127 by a polynomial of 2^f; smaller than -126 gives 2^-126, NaN stays NaN.
 #[inline(always)]
-unsafe fn exp2<V: Lanes>(x: V) -> V {
+unsafe fn exp2<V: Lanes>(x: V, polynomial: &[f32]) -> V {
     // SAFETY: arithmetic only; the caller's level is available.
     unsafe {
         let x = V::splat(-126.0).max(x);
-        let shifted = x.add(V::splat(ROUNDING));
-        let fraction = x.sub(shifted.sub(V::splat(ROUNDING)));
-        let polynomial =
-            horner(fraction, &[0.001_327_647, 0.009_675_541, 0.055_507_135, 0.240_221_2, 0.693_146_94, 1.000_000_1]);
-        polynomial.mul(shifted.power_of_two())
+        let whole = x.add(V::splat(ROUNDING)).sub(V::splat(ROUNDING));
+        horner(x.sub(whole), polynomial).scale(whole)
     }
 }
 
@@ -409,90 +459,4 @@ fn reference_erf(x: f64) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::kernels::testing::ramp;
-    use proptest::prelude::*;
-
-    #[test]
-    fn erf_is_within_a_millionth_everywhere() {
-        // Through GELU at a scale where its own rounding does not hide the error: erf = 2 gelu(x) / x - 1.
-        for simd in Simd::all() {
-            let columns = Tiling::of(simd).columns;
-            let worst = (1..4000).step_by(columns).fold(0.0f64, |worst, start| {
-                let block: Vec<f32> = (start..start + columns).map(|i| (i as f32 - 2000.0) / 300.0 + 0.001).collect();
-                let mut out = vec![0.0; columns];
-                finish_block(simd, Epilogue::BiasGelu, plain(1, &block, &vec![0.0; columns]), &mut out, columns);
-                let error = |(&x, &y): (&f32, &f32)| {
-                    let x = f64::from(x);
-                    (2.0 * f64::from(y) / x - 1.0 - reference_erf(x / std::f64::consts::SQRT_2)).abs()
-                };
-                block.iter().zip(&out).filter(|(x, _)| x.abs() > 0.3).map(error).fold(worst, f64::max)
-            });
-            assert!(worst < 1e-6, "{}: {worst:e}", simd.level());
-        }
-    }
-
-    #[test]
-    fn not_a_number_is_passed_on_and_extremes_are_not() {
-        for simd in Simd::all() {
-            let columns = Tiling::of(simd).columns;
-            let mut block = vec![0.0; columns];
-            (block[0], block[1], block[2]) = (f32::NAN, 1e30, -1e30);
-            let mut out = vec![0.0; columns];
-            finish_block(simd, Epilogue::BiasGelu, plain(1, &block, &vec![0.0; columns]), &mut out, columns);
-            assert!(out[0].is_nan(), "{}", out[0]);
-            assert!((out[1] / 1e30 - 1.0).abs() < 1e-6 && (out[2] / 1e30).abs() < 1e-6, "{:?}", &out[1..3]);
-            let mut scores = vec![1.0; 19];
-            scores[3] = f32::NAN;
-            let reciprocal = exponentiate_row(simd, Format::F32, &mut scores);
-            assert!(reciprocal.is_nan());
-            let mut scores = vec![-3e38, 0.0, -200.0];
-            assert!((exponentiate_row(simd, Format::F32, &mut scores) - 1.0).abs() < 1e-6);
-        }
-    }
-
-    #[test]
-    fn bf16_weights_are_the_f32_ones_rounded() {
-        for simd in Simd::all().filter(|&simd| Format::Bf16.is_available(simd)) {
-            for len in [1, 2, 15, 16, 17, 33, 769] {
-                let row: Vec<f32> = ramp(len, 9).iter().map(|value| value * 8.0).collect();
-                let (mut exact, mut rounded) = (row.clone(), row);
-                let sums = [Format::F32, Format::Bf16].map(|format| {
-                    let scores = if format == Format::F32 { &mut exact } else { &mut rounded };
-                    exponentiate_row(simd, format, scores)
-                });
-                assert_eq!(sums[0], sums[1]);
-                let words: &[u32] = bytemuck::cast_slice(&rounded);
-                for (at, value) in exact.iter().enumerate() {
-                    let bits = words[at / 2] >> (16 * (at % 2)) & 0xffff;
-                    assert_eq!(bits, u32::from(half::bf16::from_f32(*value).to_bits()), "{at} of {len}");
-                }
-                assert!(len % 2 == 0 || words[len / 2] >> 16 == 0, "the lone last weight of {len} has a neighbour");
-            }
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn every_level_agrees_with_the_scalar_twin(len in 1usize..200, seed in 0u32..1000, scale in 0.1f32..40.0) {
-            let row: Vec<f32> = ramp(len, seed).iter().map(|value| value * scale).collect();
-            let run = |simd| {
-                let (mut normed, mut scores) = (vec![0.0; len], row.clone());
-                normalize_rows(simd, len, 1e-6, &row, &mut normed);
-                let reciprocal = exponentiate_row(simd, Format::F32, &mut scores);
-                scale_rows(&[reciprocal], len, &mut scores, len);
-                (normed, scores)
-            };
-            let expected = run(Simd::SCALAR);
-            for simd in Simd::all() {
-                let actual = run(simd);
-                for index in 0..len {
-                    prop_assert!((actual.0[index] - expected.0[index]).abs() < 1e-4);
-                    prop_assert!((actual.1[index] - expected.1[index]).abs() < 1e-6);
-                }
-            }
-            prop_assert!((expected.1.iter().sum::<f32>() - 1.0).abs() < 1e-4);
-        }
-    }
-}
+mod tests;

@@ -197,6 +197,25 @@ impl<'a> Panel<'a> {
     }
 }
 
+/// Keeps this thread ready for products: where there are matrix registers, they stay configured until the last of these
+/// is dropped. Products do without, only slower.
+#[must_use = "dropped at once, it speeds nothing up"]
+pub struct Readiness {
+    #[cfg(target_arch = "x86_64")]
+    _registers: Option<tiles::Registers>,
+}
+
+impl Readiness {
+    /// Of the thread that calls.
+    pub fn new(simd: Simd) -> Self {
+        let _ = simd;
+        Self {
+            #[cfg(target_arch = "x86_64")]
+            _registers: (simd.level() == SimdLevel::Amx).then(|| tiles::Registers::take(simd)),
+        }
+    }
+}
+
 /// `out = left x panel` for `rows` rows (a multiple of [`Tiling::rows`]); row `i` of the result is the first `columns`
 /// elements at `out[i * out_stride]`. Both sides are in `format`; for int8 the results are the bits of i32.
 ///

@@ -34,12 +34,15 @@ pub(super) trait Lanes: Copy {
     unsafe fn mul_add(self, factor: Self, term: Self) -> Self;
     unsafe fn min(self, other: Self) -> Self;
     unsafe fn max(self, other: Self) -> Self;
-    /// 2^n of a value that is `n + ROUNDING`, -126 <= n <= 127.
-    unsafe fn power_of_two(self) -> Self;
+    /// `self * 2^n` for a whole n, -126 <= n <= 127.
+    unsafe fn scale(self, n: Self) -> Self;
     /// The bits of `self` less those of `other`, both taken as i32, as floats.
     unsafe fn integer_difference(self, other: Self) -> Self;
     unsafe fn sum(self) -> f32;
     unsafe fn maximum(self) -> f32;
+
+    /// The first sixteen bits of each number, which are a bf16, the others zero.
+    unsafe fn truncated(self) -> Self;
 
     /// Stores bf16, rounded to the nearest, two to a word: `COUNT / 2` words. At the highest level only where the CPU
     /// has AVX-512 BF16.
@@ -88,6 +91,29 @@ pub(super) trait Lanes: Copy {
         unsafe {
             self.store(padded.as_mut_ptr());
             std::ptr::copy_nonoverlapping(padded.as_ptr(), to, count);
+        }
+    }
+
+    /// As [`store_bf16`](Self::store_bf16), the first `count` elements, a lone last one beside a zero.
+    #[inline(always)]
+    unsafe fn store_bf16_partial(self, to: *mut u32, count: usize) {
+        let (mut values, mut words) = ([0.0f32; 16], [0u32; 8]);
+        // SAFETY: as above, for half as many words.
+        unsafe {
+            self.store_partial(values.as_mut_ptr(), count);
+            Self::load(values.as_ptr()).store_bf16(words.as_mut_ptr());
+            std::ptr::copy_nonoverlapping(words.as_ptr(), to, count.div_ceil(2));
+        }
+    }
+
+    /// The first `count` elements, the others zero.
+    #[inline(always)]
+    unsafe fn first(self, count: usize) -> Self {
+        let mut values = [0.0f32; 16];
+        // SAFETY: both are as long as the longest vector.
+        unsafe {
+            self.store_partial(values.as_mut_ptr(), count);
+            Self::load(values.as_ptr())
         }
     }
 }
@@ -180,12 +206,16 @@ impl Lanes for Portable {
         self.zip(other, |a, b| if a > b { a } else { b })
     }
     #[inline(always)]
-    unsafe fn power_of_two(self) -> Self {
-        Self(self.0.map(|value| f32::from_bits(value.to_bits().wrapping_add(127) << 23)))
+    unsafe fn scale(self, n: Self) -> Self {
+        self.zip(n, |value, n| value * f32::from_bits((n + ROUNDING).to_bits().wrapping_add(127) << 23))
     }
     #[inline(always)]
     unsafe fn integer_difference(self, other: Self) -> Self {
         self.zip(other, |a, b| a.to_bits().wrapping_sub(b.to_bits()).cast_signed() as f32)
+    }
+    #[inline(always)]
+    unsafe fn truncated(self) -> Self {
+        Self(self.0.map(|value| f32::from_bits(value.to_bits() & 0xffff_0000)))
     }
     #[inline(always)]
     unsafe fn sum(self) -> f32 {
@@ -248,10 +278,11 @@ impl Lanes for Avx2 {
         Self(unsafe { _mm256_max_ps(self.0, other.0) })
     }
     #[inline(always)]
-    unsafe fn power_of_two(self) -> Self {
+    unsafe fn scale(self, n: Self) -> Self {
         unsafe {
-            let biased = _mm256_add_epi32(_mm256_castps_si256(self.0), _mm256_set1_epi32(127));
-            Self(_mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased)))
+            let shifted = _mm256_castps_si256(_mm256_add_ps(n.0, _mm256_set1_ps(ROUNDING)));
+            let biased = _mm256_add_epi32(shifted, _mm256_set1_epi32(127));
+            Self(_mm256_mul_ps(self.0, _mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased))))
         }
     }
     #[inline(always)]
@@ -260,6 +291,10 @@ impl Lanes for Avx2 {
             let (a, b) = (_mm256_castps_si256(self.0), _mm256_castps_si256(other.0));
             Self(_mm256_cvtepi32_ps(_mm256_sub_epi32(a, b)))
         }
+    }
+    #[inline(always)]
+    unsafe fn truncated(self) -> Self {
+        unsafe { Self(_mm256_and_ps(self.0, _mm256_castsi256_ps(_mm256_set1_epi32(0xffff_0000u32.cast_signed())))) }
     }
     #[inline(always)]
     unsafe fn sum(self) -> f32 {
@@ -277,6 +312,13 @@ impl Lanes for Avx2 {
             _mm_cvtss_f32(_mm_max_ss(quarter, _mm_movehdup_ps(quarter)))
         }
     }
+}
+
+/// The mask of the first `count` of sixteen lanes.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+fn first_lanes(count: usize) -> __mmask16 {
+    ((1u32 << count.min(16)) - 1) as __mmask16
 }
 
 /// Sixteen floats in an AVX-512 register.
@@ -330,11 +372,8 @@ impl Lanes for Avx512 {
         Self(unsafe { _mm512_max_ps(self.0, other.0) })
     }
     #[inline(always)]
-    unsafe fn power_of_two(self) -> Self {
-        unsafe {
-            let biased = _mm512_add_epi32(_mm512_castps_si512(self.0), _mm512_set1_epi32(127));
-            Self(_mm512_castsi512_ps(_mm512_slli_epi32::<23>(biased)))
-        }
+    unsafe fn scale(self, n: Self) -> Self {
+        Self(unsafe { _mm512_scalef_ps(self.0, n.0) })
     }
     #[inline(always)]
     unsafe fn integer_difference(self, other: Self) -> Self {
@@ -344,6 +383,10 @@ impl Lanes for Avx512 {
         }
     }
     #[inline(always)]
+    unsafe fn truncated(self) -> Self {
+        unsafe { Self(_mm512_and_ps(self.0, _mm512_castsi512_ps(_mm512_set1_epi32(0xffff_0000u32.cast_signed())))) }
+    }
+    #[inline(always)]
     unsafe fn store_bf16(self, to: *mut u32) {
         // A bit pattern of 256 bits is a valid vector of integers.
         unsafe { write::<__m256i>(to.cast(), std::mem::transmute::<__m256bh, __m256i>(_mm512_cvtneps_pbh(self.0))) }
@@ -351,6 +394,18 @@ impl Lanes for Avx512 {
     #[inline(always)]
     unsafe fn store_u8(self, to: *mut u8) {
         unsafe { write::<__m128i>(to.cast(), _mm512_cvtusepi32_epi8(_mm512_cvtps_epi32(self.0))) }
+    }
+    #[inline(always)]
+    unsafe fn load_partial(from: *const f32, count: usize, fill: f32) -> Self {
+        Self(unsafe { _mm512_mask_loadu_ps(_mm512_set1_ps(fill), first_lanes(count), from) })
+    }
+    #[inline(always)]
+    unsafe fn store_partial(self, to: *mut f32, count: usize) {
+        unsafe { _mm512_mask_storeu_ps(to, first_lanes(count), self.0) }
+    }
+    #[inline(always)]
+    unsafe fn first(self, count: usize) -> Self {
+        Self(unsafe { _mm512_maskz_mov_ps(first_lanes(count), self.0) })
     }
     #[inline(always)]
     unsafe fn sum(self) -> f32 {

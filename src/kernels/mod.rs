@@ -11,6 +11,7 @@
 //! | [`peak`] | what the machine can do at most, for benchmarks |
 //! | [`operand`], `dot` | the formats of a product: f32, bf16, int8 |
 //! | `lanes`, `tiles`, [`aligned`] | vector registers by level; matrix registers (AMX); buffers on cache lines |
+//! | `transpose` | words of rows to words of columns |
 //!
 //! Every kernel takes a [`Simd`] and has a portable twin, which tests compare it with over odd sizes. Where tests ran
 //! on a CPU without AVX-512 or AMX, that level is still guarded: [`self_check`] compares every kernel with its twin on the
@@ -35,6 +36,7 @@ pub mod similarity;
 mod testing;
 #[cfg(target_arch = "x86_64")]
 mod tiles;
+mod transpose;
 
 use std::sync::OnceLock;
 

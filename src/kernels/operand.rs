@@ -77,13 +77,19 @@ pub struct Left<'a> {
     pub factors: &'a [f32],
 }
 
+impl Left<'_> {
+    /// What is left of it from row `first` on.
+    pub fn from_row(&self, first: usize) -> Self {
+        let rows = Rows { data: &self.rows.data[first * self.rows.stride..], ..self.rows };
+        Self { rows, factors: if self.factors.is_empty() { &[] } else { &self.factors[first..] } }
+    }
+}
+
 /// Room for a packed left-hand side, used again and again.
 #[derive(Default)]
 pub struct OperandBuffer {
     words: AlignedBuffer<u32>,
     factors: AlignedBuffer<f32>,
-    /// The greater and the lesser parts of a row.
-    parts: AlignedBuffer<f32>,
 }
 
 /// Which side of the scores' product a row is on.
@@ -122,15 +128,25 @@ impl OperandBuffer {
         let words = format.words(width);
         self.words.resize(rows * words);
         self.factors.resize(if format == Format::Int8 { rows } else { 0 });
-        for (row, packed) in self.words.chunks_exact_mut(words).enumerate() {
-            let source = &source[row * stride..row * stride + width];
-            if format == Format::Bf16 {
-                round_row(simd, source, packed);
-            } else {
-                self.factors[row] = quantise_row(simd, source, packed);
-            }
+        let rows = SourceRows { source: source.as_ptr(), stride, width };
+        if format == Format::Bf16 {
+            round_rows(simd, rows, &mut self.words);
+        } else {
+            quantise_rows(simd, rows, &mut self.words, &mut self.factors);
         }
         Left { rows: Rows { data: &self.words, stride: words }, factors: &self.factors }
+    }
+
+    /// Room for `rows` rows of `width` bf16, for an epilogue to fill, a row after the other; [`filled`](Self::filled)
+    /// then gives them.
+    pub fn bf16_rows(&mut self, rows: usize, width: usize) -> &mut [u32] {
+        self.words.resize(rows * Format::Bf16.words(width));
+        &mut self.words
+    }
+
+    /// What was put into [`bf16_rows`](Self::bf16_rows).
+    pub fn filled(&self, width: usize) -> Left<'_> {
+        Left { rows: Rows { data: &self.words, stride: Format::Bf16.words(width) }, factors: &[] }
     }
 
     /// As [`pack`](Self::pack), for rows of queries or keys, whose order of parts depends on their `side`.
@@ -152,79 +168,114 @@ impl OperandBuffer {
         assert!(rows == 0 || covers(source.len(), rows, stride, width), "source too short");
         let words = Format::Bf16.words(width);
         self.words.resize(rows * 3 * words);
-        self.parts.resize(2 * width);
-        let (greater, lesser) = self.parts.split_at_mut(width);
-        for (row, packed) in self.words.chunks_exact_mut(3 * words).enumerate() {
-            split_row(&source[row * stride..row * stride + width], greater, lesser);
-            let order: [&[f32]; 3] = match side {
-                ScoreSide::Query => [greater, lesser, greater],
-                ScoreSide::Key => [greater, greater, lesser],
-            };
-            for (part, packed) in order.into_iter().zip(packed.chunks_exact_mut(words)) {
-                round_row(simd, part, packed);
-            }
-        }
+        split_rows(simd, SourceRows { source: source.as_ptr(), stride, width }, side, &mut self.words);
         Rows { data: &self.words, stride: 3 * words }
     }
 }
 
-/// The greater part of each number, its first eight bits, which bf16 holds exactly, and the lesser, what is left.
-fn split_row(source: &[f32], greater: &mut [f32], lesser: &mut [f32]) {
-    for ((value, greater), lesser) in source.iter().zip(greater).zip(lesser) {
-        *greater = f32::from_bits(value.to_bits() & 0xffff_0000);
-        *lesser = value - *greater;
+/// Checked rows of whole vectors, as many as what is made of them has room for.
+#[derive(Clone, Copy)]
+struct SourceRows {
+    source: *const f32,
+    stride: usize,
+    width: usize,
+}
+
+impl SourceRows {
+    /// Where one begins.
+    #[inline(always)]
+    unsafe fn row(&self, index: usize) -> *const f32 {
+        // SAFETY: the caller counts the rows of the result, and so many were checked.
+        unsafe { self.source.add(index * self.stride) }
     }
 }
 
-/// bf16 of a row; lengths are checked by the only caller.
-fn round_row(simd: Simd, source: &[f32], packed: &mut [u32]) {
+/// bf16 of rows.
+fn round_rows(simd: Simd, rows: SourceRows, packed: &mut [u32]) {
     at_bf16_level!(
         simd,
-        (source: &[f32] = source, packed: &mut [u32] = packed),
-        round::<Portable>(source, packed),
-        round::<Avx2>(source, packed),
-        round::<Avx512>(source, packed),
+        (rows: SourceRows = rows, packed: &mut [u32] = packed),
+        round::<Portable>(rows, packed),
+        round::<Avx2>(rows, packed),
+        round::<Avx512>(rows, packed),
     );
 }
 
 #[inline(always)]
-unsafe fn round<V: Lanes>(source: &[f32], packed: &mut [u32]) {
-    // SAFETY: `pack` gives whole vectors and half as many words.
-    unsafe {
-        for at in (0..source.len()).step_by(V::COUNT) {
-            V::load(source.as_ptr().add(at)).store_bf16(packed.as_mut_ptr().add(at / 2));
+unsafe fn round<V: Lanes>(rows: SourceRows, packed: &mut [u32]) {
+    for (index, packed) in packed.chunks_exact_mut(rows.width / 2).enumerate() {
+        // SAFETY: rows are whole vectors and take half as many words.
+        unsafe {
+            for at in (0..rows.width).step_by(V::COUNT) {
+                V::load(rows.row(index).add(at)).store_bf16(packed.as_mut_ptr().add(at / 2));
+            }
         }
     }
 }
 
-/// Codes of a row, the largest magnitude becoming 127; what one is worth.
-fn quantise_row(simd: Simd, source: &[f32], packed: &mut [u32]) -> f32 {
-    at_level!(
+/// Rows of numbers, each as its first sixteen bits and what is left, rounded to as many, in the order of `side`.
+fn split_rows(simd: Simd, rows: SourceRows, side: ScoreSide, packed: &mut [u32]) {
+    at_bf16_level!(
         simd,
-        (source: &[f32] = source, packed: &mut [u32] = packed) -> f32,
-        quantise::<Portable>(source, packed),
-        quantise::<Avx2>(source, packed),
-        quantise::<Avx512>(source, packed),
-    )
+        (rows: SourceRows = rows, side: ScoreSide = side, packed: &mut [u32] = packed),
+        split::<Portable>(rows, side, packed),
+        split::<Avx2>(rows, side, packed),
+        split::<Avx512>(rows, side, packed),
+    );
 }
 
 #[inline(always)]
-unsafe fn quantise<V: Lanes>(source: &[f32], packed: &mut [u32]) -> f32 {
-    // SAFETY: `pack` gives whole vectors and a quarter as many words.
-    unsafe {
-        let mut highest = V::splat(0.0);
-        for at in (0..source.len()).step_by(V::COUNT) {
-            let value = V::load(source.as_ptr().add(at));
-            highest = highest.max(value.max(V::splat(0.0).sub(value)));
+unsafe fn split<V: Lanes>(rows: SourceRows, side: ScoreSide, packed: &mut [u32]) {
+    let words = rows.width / 2;
+    for (index, packed) in packed.chunks_exact_mut(3 * words).enumerate() {
+        // SAFETY: rows are whole vectors and take half as many words, three times.
+        unsafe {
+            for at in (0..rows.width).step_by(V::COUNT) {
+                let value = V::load(rows.row(index).add(at));
+                let greater = value.truncated();
+                let lesser = value.sub(greater);
+                let order = match side {
+                    ScoreSide::Query => [greater, lesser, greater],
+                    ScoreSide::Key => [greater, greater, lesser],
+                };
+                for (part, value) in order.into_iter().enumerate() {
+                    value.store_bf16(packed.as_mut_ptr().add(part * words + at / 2));
+                }
+            }
         }
-        let largest = highest.maximum().max(f32::MIN_POSITIVE * 256.0);
-        let (scale, centre) = (V::splat(127.0 / largest), V::splat(128.0));
-        for at in (0..source.len()).step_by(V::COUNT) {
-            // Two roundings, as every level has them: the codes are the same everywhere.
-            let code = V::load(source.as_ptr().add(at)).mul(scale).add(centre);
-            code.store_u8(packed.as_mut_ptr().cast::<u8>().add(at));
+    }
+}
+
+/// Codes of rows, the largest magnitude of each becoming 127, and what one is worth.
+fn quantise_rows(simd: Simd, rows: SourceRows, packed: &mut [u32], factors: &mut [f32]) {
+    at_level!(
+        simd,
+        (rows: SourceRows = rows, packed: &mut [u32] = packed, factors: &mut [f32] = factors),
+        quantise::<Portable>(rows, packed, factors),
+        quantise::<Avx2>(rows, packed, factors),
+        quantise::<Avx512>(rows, packed, factors),
+    );
+}
+
+#[inline(always)]
+unsafe fn quantise<V: Lanes>(rows: SourceRows, packed: &mut [u32], factors: &mut [f32]) {
+    for ((index, packed), factor) in packed.chunks_exact_mut(rows.width / 4).enumerate().zip(factors) {
+        // SAFETY: rows are whole vectors and take a quarter as many words.
+        unsafe {
+            let mut highest = V::splat(0.0);
+            for at in (0..rows.width).step_by(V::COUNT) {
+                let value = V::load(rows.row(index).add(at));
+                highest = highest.max(value.max(V::splat(0.0).sub(value)));
+            }
+            let largest = highest.maximum().max(f32::MIN_POSITIVE * 256.0);
+            let (scale, centre) = (V::splat(127.0 / largest), V::splat(128.0));
+            for at in (0..rows.width).step_by(V::COUNT) {
+                // Two roundings, as every level has them: the codes are the same everywhere.
+                let code = V::load(rows.row(index).add(at)).mul(scale).add(centre);
+                code.store_u8(packed.as_mut_ptr().cast::<u8>().add(at));
+            }
+            *factor = largest / 127.0;
         }
-        largest / 127.0
     }
 }
 

@@ -1,8 +1,8 @@
 //! Products in matrix registers (Intel AMX): eight of them, each sixteen rows of 64 bytes.
 //!
 //! The stable compiler has no intrinsics for them, but its assembler knows the instructions. No compiled code touches
-//! these registers, so they keep what they hold from one `asm!` block to the next; what a thread left there is dropped at
-//! the end of a product, so that the system need not save it.
+//! these registers, so they keep what they hold from one `asm!` block to the next; a thread drops what it left there when
+//! it has no more products to compute, so that the system need not save it.
 
 use super::Simd;
 use super::gemm::TileJob;
@@ -10,6 +10,8 @@ use super::operand::Format;
 use super::simd::SimdLevel;
 use std::arch::asm;
 use std::arch::x86_64::{__cpuid, __cpuid_count, _xgetbv};
+use std::cell::Cell;
+use std::marker::PhantomData;
 use std::sync::OnceLock;
 
 /// Words of k that one instruction sums: what a row of a register holds.
@@ -80,22 +82,35 @@ static FULL: Configuration = Configuration {
     rows: [16, 16, 16, 16, 16, 16, 16, 16, 0, 0, 0, 0, 0, 0, 0, 0],
 };
 
-/// This thread's registers while they are in use.
-struct Registers;
+thread_local! {
+    /// How many [`Registers`] this thread has.
+    static HOLDERS: Cell<usize> = const { Cell::new(0) };
+}
+
+/// This thread's registers, configured to their full size until the last of these is dropped. Configuring and
+/// releasing them takes as long as half a product of 32 rows, so whoever multiplies many panels holds one meanwhile.
+pub(super) struct Registers {
+    /// They are the thread's own: this must not go to another.
+    _thread: PhantomData<*const ()>,
+}
 
 impl Registers {
-    fn take(simd: Simd) -> Self {
+    pub(super) fn take(simd: Simd) -> Self {
         assert!(simd.level() == SimdLevel::Amx, "level {} has no tiles", simd.level());
-        // SAFETY: the token proves that the CPU has tiles and the system lets them be used; FULL is 64 bytes.
-        unsafe { asm!("ldtilecfg [{}]", in(reg) &raw const FULL, options(nostack, preserves_flags, readonly)) };
-        Self
+        if HOLDERS.replace(HOLDERS.get() + 1) == 0 {
+            // SAFETY: the token proves that the CPU has tiles and the system lets them be used; FULL is 64 bytes.
+            unsafe { asm!("ldtilecfg [{}]", in(reg) &raw const FULL, options(nostack, preserves_flags, readonly)) };
+        }
+        Self { _thread: PhantomData }
     }
 }
 
 impl Drop for Registers {
     fn drop(&mut self) {
-        // SAFETY: a `Registers` exists only where there are tiles.
-        unsafe { asm!("tilerelease", options(nostack, preserves_flags, nomem)) };
+        if HOLDERS.replace(HOLDERS.get() - 1) == 1 {
+            // SAFETY: a `Registers` exists only where there are tiles; nobody else on this thread has one.
+            unsafe { asm!("tilerelease", options(nostack, preserves_flags, nomem)) };
+        }
     }
 }
 
@@ -126,12 +141,12 @@ macro_rules! product {
                         if pair {
                             asm!(
                                 "2:",
-                                "tileloadd tmm6, [{right} + {line}*1]",
-                                "tileloadd tmm7, [{right} + {line}*1 + 64]",
                                 "tileloadd tmm4, [{upper} + {stride}*1]",
-                                "tileloadd tmm5, [{lower} + {stride}*1]",
+                                "tileloadd tmm6, [{right} + {line}*1]",
                                 concat!($dot, " tmm0, tmm4, tmm6"),
+                                "tileloadd tmm7, [{right} + {line}*1 + 64]",
                                 concat!($dot, " tmm1, tmm4, tmm7"),
+                                "tileloadd tmm5, [{lower} + {stride}*1]",
                                 concat!($dot, " tmm2, tmm5, tmm6"),
                                 concat!($dot, " tmm3, tmm5, tmm7"),
                                 "add {upper}, 64",
@@ -222,7 +237,7 @@ macro_rules! repeat {
         $(#[$doc])*
         pub(super) fn $name(simd: Simd, instructions: usize) -> f32 {
             let _registers = Registers::take(simd);
-            // SAFETY: register arithmetic on zeros, as `take` leaves them.
+            // SAFETY: register arithmetic only; whatever they hold does.
             unsafe {
                 asm!(
                     "2:",

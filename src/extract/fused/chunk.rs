@@ -5,14 +5,18 @@ use super::weights::{PackedBlock, PackedLinear};
 use crate::extract::preset::LAYER_NORM_EPS;
 use crate::kernels::Simd;
 use crate::kernels::aligned::AlignedBuffer;
-use crate::kernels::attention::{AttentionShape, attend, store_keys, store_queries, store_values};
-use crate::kernels::elementwise::{Epilogue, Product, finish_block, normalize_rows};
+use crate::kernels::attention::{AttentionShape, Place, attend, store_keys, store_queries, store_values};
+use crate::kernels::elementwise::{Epilogue, Product, finish_block, finish_gelu_bf16, normalize_rows};
 use crate::kernels::gemm::{Tiling, multiply_panel};
-use crate::kernels::operand::{Left, OperandBuffer, ScoreSide};
+use crate::kernels::operand::{Format, Left, OperandBuffer, ScoreSide};
 use std::ops::Range;
 
 /// Width of the slice of the MLP's hidden layer that exists at a time.
 pub(super) const HIDDEN_SLICE: usize = 384;
+
+/// Rows whose sums exist at a time, so that their epilogue finds them in the first-level cache: whole tiles and panels
+/// of every level.
+const BLOCK_ROWS: usize = 192;
 
 /// What every chunk of an encoder has in common.
 #[derive(Debug, Clone, Copy)]
@@ -42,7 +46,7 @@ pub(super) struct Chunk<'a> {
 /// Buffers of one thread, reused for every chunk.
 #[derive(Default)]
 pub(super) struct Scratch {
-    /// A product before its epilogue, `[chunk_rows, columns]`.
+    /// A product before its epilogue, `[BLOCK_ROWS, columns]`.
     block: AlignedBuffer<f32>,
     /// Normalised tokens, or mixed values, `[chunk_rows, dim]`.
     input: AlignedBuffer<f32>,
@@ -97,8 +101,8 @@ impl ChunkPlan {
         chunk.tokens[present..].fill(0.0);
         let Scratch { block, hidden, packed, .. } = scratch;
         let left = packed.pack(self.simd, embedding.weight.format(), rows, self.patch_len, (hidden, self.patch_len));
-        self.linear(rows, left, embedding, block, |panel, product| {
-            let out = &mut chunk.tokens[panel * self.columns()..];
+        self.linear(rows, left, embedding, block, |panel, first, product| {
+            let out = &mut chunk.tokens[first * self.dim + panel * self.columns()..];
             finish_block(self.simd, Epilogue::BiasResidual, product, out, self.dim);
         });
     }
@@ -108,26 +112,26 @@ impl ChunkPlan {
         let (rows, columns, head_dim) = (self.rows(chunk.index), self.columns(), self.shape.head_dim);
         self.normalize(chunk, rows, scratch);
         let Scratch { block: sums, input, hidden, packed, packed_block, .. } = scratch;
-        hidden.resize(self.shape.chunk_rows * columns);
+        hidden.resize(BLOCK_ROWS * columns);
         let left = packed.pack(self.simd, block.qkv.weight.format(), rows, self.dim, (input, self.dim));
-        self.linear(rows, left, &block.qkv, sums, |panel, product| {
+        self.linear(rows, left, &block.qkv, sums, |panel, token, product| {
             finish_block(self.simd, Epilogue::Bias, product, hidden, columns);
             let (part, column) = (panel * columns / self.dim, panel * columns % self.dim);
-            let (head, dim) = (column / head_dim, column % head_dim);
-            let (simd, shape, finished) = (self.simd, &self.shape, (&hidden[..rows * columns], columns));
-            let size = (rows, columns);
+            let place = Place { head: column / head_dim, dim: column % head_dim, token };
+            let (simd, shape, finished) = (self.simd, &self.shape, (&hidden[..product.rows * columns], columns));
+            let size = (product.rows, columns);
             match part {
                 0 => {
                     let words = packed_block.pack_scores(simd, shape.score_format, ScoreSide::Query, size, finished);
-                    store_queries(shape, head, dim, words, chunk.queries);
+                    store_queries(shape, place, words, chunk.queries);
                 }
                 1 => {
                     let words = packed_block.pack_scores(simd, shape.score_format, ScoreSide::Key, size, finished);
-                    store_keys(simd, shape, head, dim, words, chunk.keys);
+                    store_keys(simd, shape, place, words, chunk.keys);
                 }
                 _ => {
-                    let values = packed_block.pack(simd, shape.mix_format, rows, columns, finished);
-                    store_values(simd, shape, head, dim, values.rows, chunk.values);
+                    let values = packed_block.pack(simd, shape.mix_format, product.rows, columns, finished);
+                    store_values(simd, shape, place, values.rows, chunk.values);
                 }
             }
         });
@@ -151,8 +155,8 @@ impl ChunkPlan {
         }
         let Scratch { block: sums, input, packed, .. } = scratch;
         let left = packed.pack(self.simd, block.proj.weight.format(), rows, self.dim, (input, self.dim));
-        self.linear(rows, left, &block.proj, sums, |panel, product| {
-            let out = &mut chunk.tokens[panel * self.columns()..];
+        self.linear(rows, left, &block.proj, sums, |panel, first, product| {
+            let out = &mut chunk.tokens[first * self.dim + panel * self.columns()..];
             finish_block(self.simd, Epilogue::BiasResidual, product, out, self.dim);
         });
         self.feed_forward(chunk, rows, block, scratch);
@@ -168,15 +172,26 @@ impl ChunkPlan {
         let normalized = packed.pack(simd, fc1.weight.format(), rows, self.dim, (input, self.dim));
         for (slice, from) in (0..fc1.weight.n()).step_by(HIDDEN_SLICE).enumerate() {
             let to = fc1.weight.n().min(from + HIDDEN_SLICE);
-            self.panels((rows, normalized), fc1, 0, from / columns..to.div_ceil(columns), sums, |panel, product| {
-                let out = &mut hidden[panel * columns - from..];
-                finish_block(simd, Epilogue::BiasGelu, product, out, HIDDEN_SLICE);
-            });
-            let left = packed_block.pack(simd, fc2.weight.format(), rows, to - from, (hidden, HIDDEN_SLICE));
-            self.panels((rows, left), fc2, slice, 0..fc2.weight.panels(), sums, |panel, product| {
+            let (width, panels) = (to - from, from / columns..to.div_ceil(columns));
+            let left = if fc2.weight.format() == Format::Bf16 {
+                let words = Format::Bf16.words(width);
+                let rounded = packed_block.bf16_rows(rows, width);
+                self.panels((rows, normalized), fc1, 0, panels, sums, |panel, first, product| {
+                    let out = &mut rounded[first * words + Format::Bf16.words(panel * columns - from)..];
+                    finish_gelu_bf16(simd, product, out, words);
+                });
+                packed_block.filled(width)
+            } else {
+                self.panels((rows, normalized), fc1, 0, panels, sums, |panel, first, product| {
+                    let out = &mut hidden[first * HIDDEN_SLICE + panel * columns - from..];
+                    finish_block(simd, Epilogue::BiasGelu, product, out, HIDDEN_SLICE);
+                });
+                packed_block.pack(simd, fc2.weight.format(), rows, width, (hidden, HIDDEN_SLICE))
+            };
+            self.panels((rows, left), fc2, slice, 0..fc2.weight.panels(), sums, |panel, first, product| {
                 // The bias is added once, with the first slice.
                 let product = Product { bias: product.bias.filter(|_| slice == 0), ..product };
-                let out = &mut chunk.tokens[panel * columns..];
+                let out = &mut chunk.tokens[first * self.dim + panel * columns..];
                 finish_block(simd, Epilogue::BiasResidual, product, out, self.dim);
             });
         }
@@ -188,14 +203,14 @@ impl ChunkPlan {
         normalize_rows(self.simd, self.dim, LAYER_NORM_EPS, &chunk.tokens[..len], &mut scratch.input[..len]);
     }
 
-    /// All panels of a layer: `finish(panel, product)` sees each while it is hot.
+    /// All panels of a layer: `finish(panel, first row, product)` sees each block of rows while it is hot.
     fn linear(
         &self,
         rows: usize,
         left: Left<'_>,
         layer: &PackedLinear,
         sums: &mut AlignedBuffer<f32>,
-        finish: impl FnMut(usize, Product<'_>),
+        finish: impl FnMut(usize, usize, Product<'_>),
     ) {
         self.panels((rows, left), layer, 0, 0..layer.weight.panels(), sums, finish);
     }
@@ -208,15 +223,19 @@ impl ChunkPlan {
         slice: usize,
         panels: Range<usize>,
         sums: &mut AlignedBuffer<f32>,
-        mut finish: impl FnMut(usize, Product<'_>),
+        mut finish: impl FnMut(usize, usize, Product<'_>),
     ) {
-        sums.resize(rows * self.columns());
+        sums.resize(BLOCK_ROWS * self.columns());
         for panel in panels {
             let right = layer.weight.panel(panel, slice);
-            multiply_panel(self.simd, layer.weight.format(), rows, left.rows, right, sums, self.columns());
             let bias = Some(layer.panel_bias(self.simd, panel));
             let codes = layer.weight.codes(panel, slice);
-            finish(panel, Product { rows, block: sums, codes, factors: left.factors, bias });
+            for first in (0..rows).step_by(BLOCK_ROWS) {
+                let count = BLOCK_ROWS.min(rows - first);
+                let block = left.from_row(first);
+                multiply_panel(self.simd, layer.weight.format(), count, block.rows, right, sums, self.columns());
+                finish(panel, first, Product { rows: count, block: sums, codes, factors: block.factors, bias });
+            }
         }
     }
 }

@@ -1,10 +1,10 @@
 //! The transformer without intermediate tensors: what the service runs.
 //!
-//! The tokens of an image are cut into chunks of a few dozen rows. After the queries, keys and values of a block exist,
-//! a chunk needs no other chunk until the next block: one task takes it through attention, projection, LayerNorm, MLP,
-//! LayerNorm and the next block's projections, each product finished (bias, GELU, residual) while it is in the
-//! first-level cache. So a block of the transformer is one parallel loop over the chunks of all images, and scores and
-//! hidden activations never reach memory.
+//! The tokens of an image are cut into chunks of some dozens of rows, or a few hundred where there are matrix registers.
+//! After the queries, keys and values of a block exist, a chunk needs no other chunk until the next block: one task takes
+//! it through attention, projection, LayerNorm, MLP, LayerNorm and the next block's projections, each product finished
+//! (bias, GELU, residual) while it is in the first-level cache. So a block of the transformer is one parallel loop over
+//! the chunks of all images, and scores and hidden activations never reach memory.
 //!
 //! Products are in f32, in bf16 but for the scores of attention (f32, or bf16 in two parts), or in int8 with bf16
 //! attention; everything between them is f32.
@@ -26,7 +26,7 @@ use super::weights::{Norm, VitWeights};
 use crate::kernels::aligned::AlignedBuffer;
 use crate::kernels::attention::{AttentionShape, ScoreFormat, chunk_rows, first_row_attention};
 use crate::kernels::elementwise::normalize_rows;
-use crate::kernels::gemm::Tiling;
+use crate::kernels::gemm::{Readiness, Tiling};
 use crate::kernels::operand::Format;
 use crate::kernels::{Simd, SimdLevel};
 use crate::types::{ImageTensor, InvalidValue};
@@ -68,6 +68,7 @@ pub struct FusedEncoder {
     precision: Precision,
     geometry: Geometry,
     grid: TokenGrid,
+    /// But for the chunks, which [`plan_for`](Self::plan_for) cuts for each call.
     plan: ChunkPlan,
     embedding: PackedLinear,
     /// Positions at the input's grid, `[1 + n, dim]`; the first row has the CLS token added.
@@ -127,7 +128,7 @@ impl FusedEncoder {
             tokens: 1 + grid.len(),
             heads: geometry.heads,
             head_dim: geometry.head_dim(),
-            chunk_rows: chunk_rows(simd),
+            chunk_rows: chunk_rows(simd, 1 + grid.len(), 1, 1),
         };
         let pack =
             |block| PackedBlock::pack((simd, formats.layers), block, geometry.dim, geometry.head_dim(), HIDDEN_SLICE);
@@ -146,16 +147,24 @@ impl FusedEncoder {
         })
     }
 
+    /// How so many images are cut into chunks for the threads at hand.
+    fn plan_for(&self, images: usize) -> ChunkPlan {
+        let ChunkPlan { simd, shape, .. } = self.plan;
+        let chunk_rows = chunk_rows(simd, shape.tokens, images, rayon::current_num_threads());
+        ChunkPlan { shape: AttentionShape { chunk_rows, ..shape }, ..self.plan }
+    }
+
     /// Runs `task(image, chunk, keys, values, scratch)` for every chunk of every image, where `keys` and `values` are
     /// the image's of the current block, and then makes what the chunks wrote the current ones.
     fn each_chunk(
         &self,
+        plan: &ChunkPlan,
         images: usize,
         work: &mut Workspace,
         task: impl Fn(usize, &mut Chunk<'_>, (&[u32], &[u32]), &mut Scratch) + Sync,
     ) {
-        let shape = &self.plan.shape;
-        let (rows_len, chunks) = (shape.chunk_rows * self.plan.dim, shape.chunks());
+        let shape = &plan.shape;
+        let (rows_len, chunks) = (shape.chunk_rows * plan.dim, shape.chunks());
         let (keys_len, values_len) = (shape.keys_len(), shape.values_len());
         let queries_len = shape.chunk_rows * shape.query_len();
         let Workspace { tokens, queries, keys, values, next_keys, next_values, .. } = work;
@@ -182,6 +191,7 @@ impl FusedEncoder {
                 let of = |len: usize| image * chunks * len..(image + 1) * chunks * len;
                 let current = (&image_keys[of(keys_len)], &image_values[of(values_len)]);
                 let mut chunk = Chunk { index, tokens, queries, keys, values };
+                let _ready = Readiness::new(plan.simd);
                 self.scratches.with(|scratch| task(image, &mut chunk, current, scratch));
             });
         std::mem::swap(keys, next_keys);
@@ -190,28 +200,32 @@ impl FusedEncoder {
 
     /// Tokens and CLS attention of every image.
     fn run(&self, images: &[&[f32]], work: &mut Workspace) -> Vec<EncodedImage> {
-        let (plan, side) = (&self.plan, self.geometry.patch);
+        let (plan, side) = (&self.plan_for(images.len()), self.geometry.patch);
         let width = self.spec.input_size.width as usize;
         let mut encoded: Vec<_> = images.iter().map(|_| self.blank()).collect();
-        self.each_chunk(images.len(), work, |image, chunk, _, scratch| {
+        self.each_chunk(plan, images.len(), work, |image, chunk, _, scratch| {
             plan.embed(chunk, (images[image], width, side), &self.positions, &self.embedding, scratch);
             plan.project(chunk, &self.blocks[0], scratch);
         });
         for (index, block) in self.blocks.iter().enumerate() {
             if index == self.spec.attention_block {
-                encoded.iter_mut().enumerate().for_each(|(image, out)| self.read_attention(image, work, out));
+                for (image, out) in encoded.iter_mut().enumerate() {
+                    self.read_attention(&plan.shape, image, work, out);
+                }
             }
             if index == self.blocks.len() - 1 && index > self.spec.exit_block {
                 break;
             }
-            self.each_chunk(images.len(), work, |_, chunk, key_values, scratch| {
+            self.each_chunk(plan, images.len(), work, |_, chunk, key_values, scratch| {
                 plan.transform(chunk, key_values, block, scratch);
                 if let Some(next) = self.blocks.get(index + 1) {
                     plan.project(chunk, next, scratch);
                 }
             });
             if index == self.spec.exit_block {
-                encoded.iter_mut().enumerate().for_each(|(image, out)| self.read_tokens(image, work, out));
+                for (image, out) in encoded.iter_mut().enumerate() {
+                    self.read_tokens(&plan.shape, image, work, out);
+                }
             }
         }
         encoded
@@ -241,9 +255,9 @@ impl FusedEncoder {
         }
     }
 
-    fn read_tokens(&self, image: usize, work: &Workspace, out: &mut EncodedImage) {
+    fn read_tokens(&self, shape: &AttentionShape, image: usize, work: &Workspace, out: &mut EncodedImage) {
         let dim = self.geometry.dim;
-        let padded = self.plan.shape.chunks() * self.plan.shape.chunk_rows * dim;
+        let padded = shape.chunks() * shape.chunk_rows * dim;
         let (cls, patches) = work.tokens[image * padded..][..(1 + self.grid.len()) * dim].split_at(dim);
         (out.cls_token, out.tokens) = if self.spec.token_norm {
             (self.final_norm(cls), self.final_norm(patches))
@@ -263,14 +277,15 @@ impl FusedEncoder {
         out
     }
 
-    fn read_attention(&self, image: usize, work: &mut Workspace, out: &mut EncodedImage) {
-        let (simd, shape) = (self.plan.simd, &self.plan.shape);
+    fn read_attention(&self, shape: &AttentionShape, image: usize, work: &mut Workspace, out: &mut EncodedImage) {
+        let simd = self.plan.simd;
         let queries_len = shape.chunks() * shape.chunk_rows * shape.query_len();
         let keys_len = shape.chunks() * shape.keys_len();
         let queries = &work.queries[image * queries_len..(image + 1) * queries_len];
         let keys = &work.keys[image * keys_len..(image + 1) * keys_len];
         work.scores.resize(shape.scratch_len(simd) + shape.tokens);
         let (row, scratch) = work.scores.split_at_mut(shape.tokens);
+        let _ready = Readiness::new(simd);
         for head in 0..shape.heads {
             first_row_attention(simd, shape, head, queries, keys, scratch, row);
             out.cls_attention.extend_from_slice(&row[1..]);

@@ -131,6 +131,23 @@ fn a_batch_gives_bit_for_bit_what_single_images_give() {
 }
 
 #[test]
+fn neither_threads_nor_other_images_change_a_bit() {
+    // More tokens than fit one chunk of any level, so that how they are cut depends on both.
+    let size = ImageSize { width: 224, height: 210 };
+    let images: Vec<_> = (0..3).map(|seed| image(seed, size)).collect();
+    for (simd, precision) in everything() {
+        let fused = FusedEncoder::new(&small(6, true), spec(size, 1, false, 1), simd, precision).unwrap();
+        let expected = fused.encode(&images).unwrap();
+        for threads in [1, 3, 16] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let alone = pool.install(|| fused.encode(&images[..1])).unwrap();
+            assert!(alone[0] == expected[0], "{} with {threads} threads", fused.name());
+            assert!(pool.install(|| fused.encode(&images)).unwrap() == expected, "{} in a batch", fused.name());
+        }
+    }
+}
+
+#[test]
 fn as_an_operation_of_candle_it_gives_the_same() {
     use candle_core::{Device, Tensor};
     let size = ImageSize { width: 98, height: 70 };
