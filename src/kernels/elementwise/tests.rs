@@ -24,25 +24,6 @@ fn erf_is_within_a_millionth_everywhere() {
 }
 
 #[test]
-fn gelu_in_bf16_is_the_f32_one_rounded() {
-    for simd in Simd::all().filter(|&simd| Format::Bf16.is_available(simd)) {
-        let (columns, rows) = (Tiling::of(simd).columns, 5);
-        let (exact_stride, stride) = (columns + 3, columns / 2 + 3);
-        let block: Vec<f32> = ramp(rows * columns, 6).iter().map(|value| value * 6.0).collect();
-        let product = || plain(rows, &block, &block);
-        let (mut exact, mut rounded) = (vec![0.0; rows * exact_stride], vec![7; rows * stride]);
-        finish_block(simd, Epilogue::BiasGelu, product(), &mut exact, exact_stride);
-        finish_gelu_bf16(simd, product(), &mut rounded, stride);
-        for (at, &word) in rounded.iter().enumerate() {
-            let (row, column) = (at / stride, 2 * (at % stride));
-            let bits = |column: usize| u32::from(half::bf16::from_f32(exact[row * exact_stride + column]).to_bits());
-            let expected = if column < columns { bits(column) | bits(column + 1) << 16 } else { 7 };
-            assert_eq!(word, expected, "{}, row {row}, column {column}", simd.level());
-        }
-    }
-}
-
-#[test]
 fn not_a_number_is_passed_on_and_extremes_are_not() {
     for simd in Simd::all() {
         let columns = Tiling::of(simd).columns;
@@ -71,13 +52,13 @@ fn bf16_weights_are_the_f32_ones_rounded() {
                 let scores = if format == Format::F32 { &mut exact } else { &mut rounded };
                 exponentiate_row(simd, format, scores)
             });
-            // The shorter polynomial is off by less than a tenth of what rounding to eight bits may change.
-            assert!((of_exact / of_rounded - 1.0).abs() < 1e-4, "{of_exact} and {of_rounded}");
+            // The shorter polynomial is off by a thousandth of what rounding to eight bits may change.
+            assert!((of_exact / of_rounded - 1.0).abs() < 1e-5, "{of_exact} and {of_rounded}");
             let words: &[u32] = bytemuck::cast_slice(&rounded);
             for (at, value) in exact.iter().enumerate() {
                 let bits = (words[at / 2] >> (16 * (at % 2)) & 0xffff) as u16;
                 let error = (half::bf16::from_bits(bits).to_f32() / value - 1.0).abs();
-                assert!(error < 1.05 / 256.0, "{at} of {len}: off by {error}");
+                assert!(error < 1.01 / 256.0, "{at} of {len}: off by {error}");
             }
             assert!(len % 2 == 0 || words[len / 2] >> 16 == 0, "the lone last weight of {len} has a neighbour");
         }
