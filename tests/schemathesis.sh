@@ -31,6 +31,8 @@ finish() {
 }
 trap finish EXIT
 
+# A busy machine may take long over a photo; that is not what is tested here.
+export PLACEFORMER_PIPELINE__DEADLINE_MS=120000 PLACEFORMER_PIPELINE__MAX_WAIT_MS=60000
 "$BIN" serve --listen 127.0.0.1:0 --data "$work/data" >"$work/address" 2>"$work/log" &
 server=$!
 url=
