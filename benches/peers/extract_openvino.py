@@ -12,8 +12,6 @@ which a busy machine disturbs least.
 
 import argparse
 import json
-import statistics
-import time
 
 import numpy as np
 import onnx
@@ -21,6 +19,7 @@ import onnxruntime
 import openvino
 from onnx import TensorProto, helper, numpy_helper
 from safetensors.numpy import load_file
+from timing import measure
 
 HEADS, PATCH = 6, 14
 
@@ -156,17 +155,6 @@ def onnxruntime_runner(model, threads):
     options.intra_op_num_threads = threads
     session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
     return lambda pixels: session.run(None, {"pixels": pixels})
-
-
-def measure(run, pixels, repetitions):
-    run(pixels)
-    times, busy = [], time.process_time()
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        run(pixels)
-        times.append((time.perf_counter() - start) * 1e3 / len(pixels))
-    busy = (time.process_time() - busy) * 1e3 / len(pixels) / repetitions
-    return {"median_ms": round(statistics.median(times), 2), "least_ms": round(min(times), 2), "cpu_ms": round(busy, 2)}
 
 
 def main():

@@ -6,17 +6,17 @@ requirements of the other peers, because its wheel brings several gigabytes of C
     pip install torch==2.15.0 numpy safetensors
     python benches/peers/extract_torch.py MODEL.safetensors [--size 448x336] [--blocks 12] [--threads 2]
 
-Prints one JSON object: milliseconds per image by precision and batch, median and least.
+Prints one JSON object: milliseconds per image by precision and batch, median and least, and the CPU time of all
+threads.
 """
 
 import argparse
 import json
-import statistics
-import time
 
 import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file
+from timing import measure
 
 HEADS, PATCH = 6, 14
 
@@ -54,16 +54,6 @@ class Backbone:
             hidden = F.gelu(self.linear(self.norm(x, f"{base}.norm2"), f"{base}.mlp.fc1"))
             x = x + self.linear(hidden, f"{base}.mlp.fc2") * self.weights[f"{base}.layer_scale2.lambda1"]
         return x
-
-
-def measure(run, pixels, repetitions):
-    run(pixels)
-    times = []
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        run(pixels)
-        times.append((time.perf_counter() - start) * 1e3 / len(pixels))
-    return {"median_ms": round(statistics.median(times), 2), "least_ms": round(min(times), 2)}
 
 
 def main():

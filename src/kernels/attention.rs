@@ -451,6 +451,7 @@ mod tests {
             }
         }
     }
+
     #[test]
     fn the_slowest_thread_decides_how_long_a_layer_takes() {
         let time = |rows| rows + ROWS_OF_WEIGHTS;

@@ -168,7 +168,6 @@ impl ChunkPlan {
         self.normalize(chunk, rows, scratch);
         let Scratch { block: sums, input, hidden, packed, packed_block, .. } = scratch;
         let (fc1, fc2) = (&block.fc1, &block.fc2);
-        hidden.resize(self.shape.chunk_rows * HIDDEN_SLICE);
         let normalized = packed.pack(simd, fc1.weight.format(), rows, self.dim, (input, self.dim));
         for (slice, from) in (0..fc1.weight.n()).step_by(HIDDEN_SLICE).enumerate() {
             let to = fc1.weight.n().min(from + HIDDEN_SLICE);
@@ -182,6 +181,7 @@ impl ChunkPlan {
                 });
                 packed_block.filled(width)
             } else {
+                hidden.resize(self.shape.chunk_rows * HIDDEN_SLICE);
                 self.panels((rows, normalized), fc1, 0, panels, sums, |panel, first, product| {
                     let out = &mut hidden[first * HIDDEN_SLICE + panel * columns - from..];
                     finish_block(simd, Epilogue::BiasGelu, product, out, HIDDEN_SLICE);
