@@ -38,14 +38,12 @@ impl Limits {
     }
 
     /// What the layers and the attention of an encoder of this name can reach: its name tells its precision
-    /// (`fused-bf16-avx512`). At bf16, half of attention, the scores, is at f32, or takes three products of bf16 in matrix
-    /// registers; with layers at int8, all of it is at bf16.
+    /// (`fused-bf16-avx512`). With layers at int8, attention is at bf16.
     pub(super) fn encoder_giga_operations(&self, encoder: &str) -> (f64, f64) {
         let bf16 = self.bf16_gflops.unwrap_or(self.f32_gflops);
         match () {
             () if encoder.contains("int8") => (self.int8_gops.unwrap_or(self.f32_gflops), bf16),
-            () if encoder.contains("bf16-amx") => (bf16, bf16 / 2.0),
-            () if encoder.contains("bf16") => (bf16, 2.0 / (1.0 / bf16 + 1.0 / self.f32_gflops)),
+            () if encoder.contains("bf16") => (bf16, bf16),
             () => (self.f32_gflops, self.f32_gflops),
         }
     }

@@ -1,16 +1,17 @@
 //! Descriptors of a whole data set, kept on disk so that an interrupted run resumes and a second one starts at once.
 //!
-//! A record is found by the model's identity and the hash of the image's content: renaming or copying images costs
-//! nothing, changing one image or one setting recomputes just what it must. Records are written beside their place
+//! A record is found by the model's identity, what a fixed picture gives on this machine, and the hash of the image's
+//! content: renaming or copying images costs nothing, changing one image, one setting or one rounding of a kernel
+//! recomputes just what it must. Records are written beside their place
 //! and renamed into it, and carry a checksum: a half-written or damaged one is as good as none. An image that cannot
 //! be read is listed with its reason and takes no part; it never vanishes in silence.
 
 use super::EvalError;
 use super::datasets::Item;
 use crate::extract::Extractor;
-use crate::image::{ImageConfig, load_tensor};
+use crate::image::{ImageConfig, RgbImage, encode_jpeg, load_tensor};
 use crate::store::codec;
-use crate::types::{ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, PackedPatches};
+use crate::types::{ContentHash, Descriptor, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches};
 use indicatif::ProgressBar;
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
@@ -24,10 +25,11 @@ use std::time::Instant;
 pub trait Describe: Sync {
     /// Identity of everything the descriptors depend on.
     fn model(&self) -> &ModelId;
-    /// What computes them. Descriptors of one model compare whatever did, but a measurement must not mix them.
-    fn computed_by(&self) -> String {
-        String::new()
-    }
+    /// The name of what computes them, for people.
+    fn computed_by(&self) -> String;
+    /// A hash of what a fixed picture gives, from its bytes on. Descriptors of one model compare whatever computed
+    /// them, but a measurement must not mix those of two builds whose kernels, decoder or resizing differ.
+    fn fingerprint(&self) -> Result<ContentHash, EvalError>;
     /// Decodes and normalises; the error says what is wrong with the image.
     fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String>;
     /// One descriptor per image.
@@ -53,6 +55,16 @@ impl Describe for ModelDescriber {
         self.extractor.encoder_name()
     }
 
+    fn fingerprint(&self) -> Result<ContentHash, EvalError> {
+        let setting = |error: String| EvalError::Setting(format!("the picture that tells builds apart: {error}"));
+        let picture = encode_jpeg(&probe_picture(self.extractor.input_size()), 90);
+        let bytes = picture.map_err(|error| setting(error.to_string()))?;
+        let descriptor = self.describe(&[self.tensor(&bytes).map_err(setting)?])?.pop();
+        let descriptor = descriptor.ok_or_else(|| setting("no descriptor".into()))?;
+        let mut untimed = Record { seconds: ExtractionSeconds::default(), blob_bytes: 0, descriptor };
+        Ok(ContentHash::of(&untimed.encode()?))
+    }
+
     fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String> {
         load_tensor(bytes, &self.limits, self.extractor.input_size()).map_err(|error| error.to_string())
     }
@@ -65,6 +77,15 @@ impl Describe for ModelDescriber {
         let described = self.extractor.extract_full(std::slice::from_ref(image))?.pop();
         described.map(|(_, patches)| patches).ok_or_else(|| EvalError::Setting("one image gave no descriptor".into()))
     }
+}
+
+/// Waves and steps of all three colours, half as large again as the model's input so that it is resized.
+fn probe_picture(input: ImageSize) -> RgbImage {
+    let size = ImageSize { width: input.width * 3 / 2, height: input.height * 3 / 2 };
+    let pixel =
+        |x: u32, y: u32| [x * 7 + y, (x / 24 * 50) ^ (y / 40 * 90), x * y / 64].map(|value| (value % 256) as u8);
+    let pixels = (0..size.height).flat_map(|y| (0..size.width).flat_map(move |x| pixel(x, y))).collect();
+    RgbImage { size, pixels }
 }
 
 /// Which vector is searched.
@@ -162,7 +183,7 @@ const BATCH: usize = 4;
 impl FeatureCache {
     /// Opens (and creates) what `describer` recorded below `root`, holding at most `memory_bytes` of key patches.
     pub fn open(root: &Path, describer: &dyn Describe, memory_bytes: u64) -> Result<Self, EvalError> {
-        let identity = format!("{} {}", describer.model(), describer.computed_by());
+        let identity = format!("{} {} {}", describer.model(), describer.computed_by(), describer.fingerprint()?);
         let name = ContentHash::of(identity.as_bytes()).to_string();
         let folder = root.join(&name[..16]);
         std::fs::create_dir_all(&folder).map_err(EvalError::io(&folder))?;

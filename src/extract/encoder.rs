@@ -90,7 +90,7 @@ pub enum Precision {
     Auto,
     /// 32-bit floats.
     F32,
-    /// bfloat16 products, 32-bit sums and scores.
+    /// bfloat16 products, 32-bit sums.
     Bf16,
     /// 8-bit integer products, 32-bit sums.
     Int8,

@@ -65,42 +65,11 @@ fn group_scores(simd: Simd) -> usize {
     if simd.level() == SimdLevel::Amx { 80 * 1024 } else { 40 * 1024 }
 }
 
-/// How queries and keys are stored, and thereby how their products are computed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ScoreFormat {
-    /// As f32.
-    F32,
-    /// Rounded to bf16.
-    Bf16,
-    /// As the sum of two bf16, sixteen bits in all: three bf16 products, which matrix registers do sooner than vectors
-    /// do one of f32. Words of a row's dimensions hold the greater parts, then for queries the lesser and the greater
-    /// again, for keys the greater again and the lesser.
-    SplitBf16,
-}
-
-impl ScoreFormat {
-    /// The format of the products.
-    pub fn product(self) -> Format {
-        match self {
-            Self::F32 => Format::F32,
-            Self::Bf16 | Self::SplitBf16 => Format::Bf16,
-        }
-    }
-
-    /// Words that `count` numbers take.
-    fn words(self, count: usize) -> usize {
-        let parts = if self == Self::SplitBf16 { 3 } else { 1 };
-        parts * self.product().words(count)
-    }
-}
-
 /// How the tokens of an image and their heads are laid out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AttentionShape {
-    /// Format of queries and keys.
-    pub score_format: ScoreFormat,
-    /// Format of weights and values: f32 or bf16.
-    pub mix_format: Format,
+    /// Format of both products: f32 or bf16.
+    pub format: Format,
     /// Tokens of an image, CLS included.
     pub tokens: usize,
     /// Heads.
@@ -132,8 +101,13 @@ impl AttentionShape {
         self.heads * self.head_words()
     }
 
+    /// Where in a chunk's queries (`[chunk_rows, query_len]`) a block of their projection begins.
+    pub fn query_at(&self, place: Place) -> usize {
+        place.token * self.query_len() + place.head * self.head_words() + self.format.words(place.dim)
+    }
+
     fn head_words(&self) -> usize {
-        self.score_format.words(self.head_dim)
+        self.format.words(self.head_dim)
     }
 
     fn head_keys(&self) -> usize {
@@ -141,7 +115,7 @@ impl AttentionShape {
     }
 
     fn head_values(&self) -> usize {
-        self.mix_format.words(self.chunk_rows) * self.head_dim
+        self.format.words(self.chunk_rows) * self.head_dim
     }
 
     fn padded_tokens(&self) -> usize {
@@ -170,19 +144,7 @@ pub struct Place {
     pub token: usize,
 }
 
-/// Writes finished rows of the query projection in the shape's format to their places in `queries`
-/// (`[chunk_rows, query_len]`).
-///
-/// # Panics
-/// If `queries` is too short.
-pub fn store_queries(shape: &AttentionShape, place: Place, block: Rows<'_>, queries: &mut [u32]) {
-    let at = place.head * shape.head_words() + shape.score_format.words(place.dim);
-    for (row, words) in block.data.chunks_exact(block.stride).enumerate() {
-        queries[(place.token + row) * shape.query_len() + at..][..words.len()].copy_from_slice(words);
-    }
-}
-
-/// As [`store_queries`], to a chunk's keys.
+/// Writes finished rows of the key projection in the shape's format to their places in a chunk's keys.
 ///
 /// # Panics
 /// If `keys` is not a chunk of `shape`, or the place not the first of a panel.
@@ -190,7 +152,7 @@ pub fn store_keys(simd: Simd, shape: &AttentionShape, place: Place, block: Rows<
     let (columns, panel_len) = (Tiling::of(simd).columns, shape.head_words() * Tiling::of(simd).columns);
     assert_eq!(keys.len(), shape.keys_len(), "not one chunk of keys");
     assert_eq!(place.token % columns, 0, "keys are written by whole panels");
-    let first = shape.score_format.words(place.dim) * columns;
+    let first = shape.format.words(place.dim) * columns;
     let head = &mut keys[place.head * shape.head_keys()..][..shape.head_keys()];
     let panels = head.chunks_exact_mut(panel_len).skip(place.token / columns);
     for (rows, panel) in block.data.chunks(columns * block.stride).zip(panels) {
@@ -206,10 +168,10 @@ pub fn store_keys(simd: Simd, shape: &AttentionShape, place: Place, block: Rows<
 pub fn store_values(simd: Simd, shape: &AttentionShape, place: Place, block: Rows<'_>, values: &mut [u32]) {
     let columns = Tiling::of(simd).columns;
     assert_eq!(values.len(), shape.values_len(), "not one chunk of values");
-    let words = |tokens: usize| shape.mix_format.words(tokens);
+    let words = |tokens: usize| shape.format.words(tokens);
     let row = place.dim / columns * words(shape.chunk_rows) + words(place.token);
     let panel = &mut values[place.head * shape.head_values() + row * columns..];
-    if shape.mix_format == Format::F32 {
+    if shape.format == Format::F32 {
         return panel[..block.data.len()].copy_from_slice(block.data);
     }
     for (pair, out) in block.data.chunks_exact(2 * block.stride).zip(panel.chunks_exact_mut(columns)) {
@@ -238,7 +200,7 @@ fn score(
         let at = panel / per_chunk * shape.keys_len() + head * shape.head_keys() + panel % per_chunk * panel_len;
         let right = Panel::whole(&keys[at..at + panel_len], shape.head_words());
         let out = &mut out[panel * columns..];
-        multiply_panel(simd, shape.score_format.product(), rows, queries, right, out, shape.padded_tokens());
+        multiply_panel(simd, shape.format, rows, queries, right, out, shape.padded_tokens());
     }
 }
 
@@ -270,19 +232,19 @@ pub fn attend(
         let count = group.min(rows - first);
         score(simd, shape, head, head_queries(shape, head, first, queries), count, keys, scratch);
         for (row, reciprocal) in scratch.chunks_exact_mut(width).zip(&mut reciprocals[..count]) {
-            *reciprocal = exponentiate_row(simd, shape.mix_format, &mut row[..shape.tokens]);
+            *reciprocal = exponentiate_row(simd, shape.format, &mut row[..shape.tokens]);
         }
         let out = &mut out[first * out_stride..];
         for dim in (0..shape.head_dim).step_by(columns) {
-            let segment_rows = shape.mix_format.words(shape.chunk_rows);
+            let segment_rows = shape.format.words(shape.chunk_rows);
             let panel = Panel {
                 data: &values[head * shape.head_values() + dim * segment_rows..],
-                k: shape.mix_format.words(shape.tokens),
+                k: shape.format.words(shape.tokens),
                 segment_rows,
                 segment_stride: shape.values_len(),
             };
             let weights = Rows::f32(scratch, width);
-            multiply_panel(simd, shape.mix_format, count, weights, panel, &mut out[dim..], out_stride);
+            multiply_panel(simd, shape.format, count, weights, panel, &mut out[dim..], out_stride);
         }
         scale_rows(&reciprocals[..count], shape.head_dim, out, out_stride);
     }
@@ -307,30 +269,22 @@ pub fn first_row_attention(
     scale_rows(&[reciprocal], shape.tokens, out, shape.tokens);
 }
 
+/// Formats that both products can be in.
+const FORMATS: [Format; 2] = [Format::F32, Format::Bf16];
+
 /// Blocked attention against the definition in f64, on a token count that fills no panel.
 pub(super) fn check(simd: Simd) -> Result<(), String> {
-    for formats in formats(simd) {
+    for format in FORMATS.into_iter().filter(|format| format.is_available(simd)) {
         for extra in 1..4 {
-            compare_with_definition(simd, formats, fewest_chunk_rows(simd) + 10 * extra + 1, 2, 32)?;
+            compare_with_definition(simd, format, fewest_chunk_rows(simd) + 10 * extra + 1, 2, 32)?;
         }
     }
     Ok(())
 }
 
-/// The formats of scores and of the mix that a level can.
-fn formats(simd: Simd) -> impl Iterator<Item = (ScoreFormat, Format)> {
-    let pairs = [
-        (ScoreFormat::F32, Format::F32),
-        (ScoreFormat::F32, Format::Bf16),
-        (ScoreFormat::Bf16, Format::Bf16),
-        (ScoreFormat::SplitBf16, Format::Bf16),
-    ];
-    pairs.into_iter().filter(move |pair| pair.0.product().is_available(simd) && pair.1.is_available(simd))
-}
-
 /// Queries, keys and values `[tokens, dim]` of one image, laid out as the encoder does.
 fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, Vec<u32>, Vec<u32>) {
-    use super::operand::{OperandBuffer, ScoreSide};
+    use super::operand::OperandBuffer;
     let (columns, dim) = (Tiling::of(simd).columns, shape.heads * shape.head_dim);
     let nothing = f32::NAN.to_bits();
     let mut queries = vec![nothing; shape.padded_tokens() * shape.query_len()];
@@ -351,12 +305,14 @@ fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, 
             let mut buffers = [(); 3].map(|()| OperandBuffer::default());
             let [of_query, of_key, of_value] = &mut buffers;
             let block = |part: usize| (&blocks[part][..], columns);
-            let query = of_query.pack_scores(simd, shape.score_format, ScoreSide::Query, (filled, columns), block(0));
-            let key = of_key.pack_scores(simd, shape.score_format, ScoreSide::Key, (filled, columns), block(1));
-            let value = of_value.pack(simd, shape.mix_format, filled, columns, block(2)).rows;
-            let first = chunk * shape.chunk_rows * shape.query_len();
+            let query = of_query.pack(simd, shape.format, filled, columns, block(0)).rows;
+            let key = of_key.pack(simd, shape.format, filled, columns, block(1)).rows;
+            let value = of_value.pack(simd, shape.format, filled, columns, block(2)).rows;
             let place = Place { head, dim: within, token: 0 };
-            store_queries(shape, place, query, &mut queries[first..]);
+            let first = chunk * shape.chunk_rows * shape.query_len() + shape.query_at(place);
+            for (row, words) in query.data.chunks_exact(query.stride).enumerate() {
+                queries[first + row * shape.query_len()..][..words.len()].copy_from_slice(words);
+            }
             store_keys(simd, shape, place, key, &mut keys[of(shape.keys_len())]);
             store_values(simd, shape, place, value, &mut values[of(shape.values_len())]);
         }
@@ -366,24 +322,18 @@ fn lay_out(simd: Simd, shape: &AttentionShape, rows: [&[f32]; 3]) -> (Vec<u32>, 
 
 fn compare_with_definition(
     simd: Simd,
-    (score_format, mix_format): (ScoreFormat, Format),
+    format: Format,
     tokens: usize,
     heads: usize,
     head_dim: usize,
 ) -> Result<(), String> {
     use super::testing::{differ, ramp};
-    let shape =
-        AttentionShape { score_format, mix_format, tokens, heads, head_dim, chunk_rows: fewest_chunk_rows(simd) };
+    let shape = AttentionShape { format, tokens, heads, head_dim, chunk_rows: fewest_chunk_rows(simd) };
     let (dim, padded) = (heads * head_dim, shape.padded_tokens());
     let [query_rows, key_rows, value_rows] = [11, 12, 13].map(|seed| ramp(padded * dim, seed));
     let (queries, keys, values) = lay_out(simd, &shape, [&query_rows, &key_rows, &value_rows]);
     // bf16 keeps eight bits: of the scores, then of the weights.
-    let (of_values, of_weights) = match (score_format, mix_format) {
-        (ScoreFormat::F32, Format::F32) => (1e-5, 1e-5),
-        (ScoreFormat::F32, _) => (5e-3, 1e-5),
-        (ScoreFormat::SplitBf16, _) => (5e-3, 5e-5),
-        (ScoreFormat::Bf16, _) => (2e-2, 5e-3),
-    };
+    let (of_values, of_weights) = if format == Format::F32 { (1e-5, 1e-5) } else { (2e-2, 5e-3) };
     let rows = Tiling::of(simd).rows * 3;
     let (mut scratch, mut out) = (vec![f32::NAN; shape.scratch_len(simd)], vec![0.0; rows * dim]);
     let mut first = vec![0.0; tokens];
@@ -403,16 +353,12 @@ fn compare_with_definition(
                 let mix = |token: usize| weights[token] / total * f64::from(value_rows[token * dim + at + i]);
                 let (actual, expected) = (out[row * dim + at + i], (0..tokens).map(mix).sum());
                 if differ(actual, expected, of_values) {
-                    return Err(format!(
-                        "{score_format:?}, {mix_format:?}, {tokens} tokens, row {row}: {actual} is not {expected}"
-                    ));
+                    return Err(format!("{format:?}, {tokens} tokens, row {row}: {actual} is not {expected}"));
                 }
             }
             let off = |t: &usize| row == 0 && differ(first[*t], weights[*t] / total, of_weights);
             if let Some(token) = (0..tokens).find(off) {
-                return Err(format!(
-                    "{score_format:?}, {mix_format:?}, {tokens} tokens: weight {token} of the first row is off"
-                ));
+                return Err(format!("{format:?}, {tokens} tokens: weight {token} of the first row is off"));
             }
         }
     }
@@ -429,8 +375,8 @@ mod tests {
         #[test]
         fn equals_the_definition(tokens in 36usize..180, heads in 1usize..3) {
             for simd in Simd::all() {
-                for formats in formats(simd) {
-                    prop_assert_eq!(compare_with_definition(simd, formats, tokens, heads, 32), Ok(()));
+                for format in FORMATS.into_iter().filter(|format| format.is_available(simd)) {
+                    prop_assert_eq!(compare_with_definition(simd, format, tokens, heads, 32), Ok(()));
                 }
             }
         }

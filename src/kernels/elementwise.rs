@@ -1,16 +1,15 @@
 //! What a transformer does between its matrix products: LayerNorm, softmax, and the epilogues that add bias, GELU and
 //! residual to a product while it is still in the first-level cache.
-//!
-//! `exp2` and `erf` are polynomials: 2^f on [-0.5, 0.5] of degree 5 (relative error 1e-7), or 4 (3e-6) where the result
-//! is rounded to eight bits anyway, and erf(x) = x P(x^2) up to 3.7, of degree 13 in x^2 mapped to [-1, 1], 1 beyond
-//! (absolute error 4e-7). All were fitted for the smallest maximal error.
+
+mod polynomials;
 
 use super::Simd;
 use super::gemm::{PanelCodes, Tiling, covers};
 #[cfg(target_arch = "x86_64")]
 use super::lanes::{Avx2, Avx512};
-use super::lanes::{Lanes, Portable, ROUNDING, at_bf16_level, at_level};
+use super::lanes::{Lanes, Portable, at_bf16_level, at_level};
 use super::operand::Format;
+use polynomials::{EXP2, EXP2_SHORT, GELU, GELU_SHORT, exp2, gelu};
 
 /// What is done with a finished block of a matrix product.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,8 +18,15 @@ pub enum Epilogue {
     Bias,
     /// `out = gelu(block + bias)`, with the exact (erf) GELU.
     BiasGelu,
+    /// As `BiasGelu`, with an error of 8e-5 that eight bits do not show.
+    BiasShortGelu,
     /// `out += block + bias`.
     BiasResidual,
+}
+
+impl Epilogue {
+    /// Every epilogue.
+    const ALL: [Self; 4] = [Self::Bias, Self::BiasGelu, Self::BiasShortGelu, Self::BiasResidual];
 }
 
 /// A finished block of a matrix product, `[rows, columns]` with `columns` as in [`Tiling`].
@@ -58,24 +64,36 @@ pub fn finish_block(simd: Simd, epilogue: Epilogue, product: Product<'_>, out: &
     );
 }
 
-/// As [`finish_block`] with [`Epilogue::BiasGelu`], rounded to bf16, two to a word: row `i` of `out` starts at
-/// `i * out_stride` and has half as many words as the product columns.
+/// As [`finish_block`] but for the residual, in `format`: row `i` of `out` starts at `i * out_stride` and has
+/// [`Format::words`] of the product's columns.
 ///
 /// # Panics
-/// If a slice is too short, or bf16 not available at this level.
-pub fn finish_gelu_bf16(simd: Simd, product: Product<'_>, out: &mut [u32], out_stride: usize) {
+/// If a slice is too short, the epilogue is [`Epilogue::BiasResidual`], or the format is int8 or not available at this
+/// level.
+pub fn finish_words(
+    simd: Simd,
+    format: Format,
+    epilogue: Epilogue,
+    product: Product<'_>,
+    out: &mut [u32],
+    out_stride: usize,
+) {
+    assert!(format != Format::Int8 && epilogue != Epilogue::BiasResidual, "{epilogue:?} does not end in {format:?}");
+    if format == Format::F32 {
+        return finish_block(simd, epilogue, product, bytemuck::cast_slice_mut(out), out_stride);
+    }
     if product.rows == 0 {
         return;
     }
     let columns = product.check(simd);
-    assert!(covers(out.len(), product.rows, out_stride, columns / 2), "result too short");
+    assert!(covers(out.len(), product.rows, out_stride, format.words(columns)), "result too short");
     let job = FinishJob { columns, product, out: out.as_mut_ptr(), out_stride };
     at_bf16_level!(
         simd,
-        (job: &FinishJob<'_, u32> = &job),
-        job.run_gelu_bf16::<Portable>(),
-        job.run_gelu_bf16::<Avx2>(),
-        job.run_gelu_bf16::<Avx512>(),
+        (job: &FinishJob<'_, u32> = &job, epilogue: Epilogue = epilogue),
+        job.run_bf16::<Portable>(epilogue),
+        job.run_bf16::<Avx2>(epilogue),
+        job.run_bf16::<Avx512>(epilogue),
     );
 }
 
@@ -112,7 +130,10 @@ impl FinishJob<'_, f32> {
             let place = |row: usize, column: usize| self.out.add(row * self.out_stride + column);
             match epilogue {
                 Epilogue::Bias => self.each::<V>(|value, row, column| value.store(place(row, column))),
-                Epilogue::BiasGelu => self.each::<V>(|value, row, column| gelu(value).store(place(row, column))),
+                Epilogue::BiasGelu => self.each::<V>(|value, row, column| gelu(value, &GELU).store(place(row, column))),
+                Epilogue::BiasShortGelu => {
+                    self.each::<V>(|value, row, column| gelu(value, &GELU_SHORT).store(place(row, column)));
+                }
                 Epilogue::BiasResidual => self.each::<V>(|value, row, column| {
                     let place = place(row, column);
                     value.add(V::load(place)).store(place);
@@ -124,12 +145,21 @@ impl FinishJob<'_, f32> {
 
 impl FinishJob<'_, u32> {
     #[inline(always)]
-    unsafe fn run_gelu_bf16<V: Lanes>(&self) {
-        // SAFETY: `finish_gelu_bf16` has checked the extents.
+    unsafe fn run_bf16<V: Lanes>(&self, epilogue: Epilogue) {
+        // SAFETY: `finish_words` has checked the extents.
         unsafe {
-            self.each::<V>(|value, row, column| {
-                gelu(value).store_bf16(self.out.add(row * self.out_stride + column / 2));
-            });
+            let place = |row: usize, column: usize| self.out.add(row * self.out_stride + column / 2);
+            match epilogue {
+                Epilogue::BiasGelu => {
+                    self.each::<V>(|value, row, column| gelu(value, &GELU).store_bf16(place(row, column)));
+                }
+                Epilogue::BiasShortGelu => {
+                    self.each::<V>(|value, row, column| gelu(value, &GELU_SHORT).store_bf16(place(row, column)));
+                }
+                Epilogue::Bias | Epilogue::BiasResidual => {
+                    self.each::<V>(|value, row, column| value.store_bf16(place(row, column)));
+                }
+            }
         }
     }
 }
@@ -315,77 +345,6 @@ pub fn scale_rows(factors: &[f32], columns: usize, out: &mut [f32], stride: usiz
     }
 }
 
-/// 2^f on [-0.5, 0.5], highest power first.
-const EXP2: [f32; 6] = [0.001_327_647, 0.009_675_541, 0.055_507_135, 0.240_221_2, 0.693_146_94, 1.000_000_1];
-
-/// The same for results that are rounded to eight bits.
-const EXP2_SHORT: [f32; 5] = [0.009_570_101, 0.055_917_86, 0.240_247_44, 0.693_121_8, 0.999_999_3];
-
-/// 2^x for x up to 127 by a polynomial of 2^f; smaller than -126 gives 2^-126, NaN stays NaN.
-#[inline(always)]
-unsafe fn exp2<V: Lanes>(x: V, polynomial: &[f32]) -> V {
-    // SAFETY: arithmetic only; the caller's level is available.
-    unsafe {
-        let x = V::splat(-126.0).max(x);
-        let whole = x.add(V::splat(ROUNDING)).sub(V::splat(ROUNDING));
-        horner(x.sub(whole), polynomial).scale(whole)
-    }
-}
-
-/// x (1 + erf(x / sqrt 2)) / 2.
-#[inline(always)]
-unsafe fn gelu<V: Lanes>(x: V) -> V {
-    // SAFETY: as in `exp2`.
-    unsafe {
-        let half = x.mul(V::splat(0.5));
-        half.mul_add(erf(x.mul(V::splat(std::f32::consts::FRAC_1_SQRT_2))), half)
-    }
-}
-
-/// The largest argument the polynomial of erf covers.
-const ERF_LIMIT: f32 = 3.7;
-
-/// P of erf(x) = x P(2 x^2 / limit^2 - 1), highest power first.
-const ERF: [f32; 14] = [
-    -0.001_504_677_7,
-    0.003_927_413_4,
-    -0.003_647_331,
-    0.005_223_222,
-    -0.014_151_709,
-    0.025_146_15,
-    -0.036_200_248,
-    0.051_475_354,
-    -0.070_436_64,
-    0.090_624_89,
-    -0.112_645_57,
-    0.140_789_54,
-    -0.190_467_73,
-    0.382_137_54,
-];
-
-#[inline(always)]
-unsafe fn erf<V: Lanes>(x: V) -> V {
-    // SAFETY: as in `exp2`.
-    unsafe {
-        let x = V::splat(-ERF_LIMIT).max(V::splat(ERF_LIMIT).min(x));
-        let mapped = x.mul(x).mul_add(V::splat(2.0 / (ERF_LIMIT * ERF_LIMIT)), V::splat(-1.0));
-        V::splat(-1.0).max(V::splat(1.0).min(x.mul(horner(mapped, &ERF))))
-    }
-}
-
-/// A polynomial, highest power first.
-#[inline(always)]
-unsafe fn horner<V: Lanes>(x: V, coefficients: &[f32]) -> V {
-    // SAFETY: as in `exp2`; every caller passes at least one coefficient.
-    unsafe {
-        let mut value = V::splat(coefficients[0]);
-        for &coefficient in &coefficients[1..] {
-            value = value.mul_add(x, V::splat(coefficient));
-        }
-        value
-    }
-}
-
 /// LayerNorm, softmax and the epilogues against the definition in f64, on odd sizes.
 pub(super) fn check(simd: Simd) -> Result<(), String> {
     use super::testing::{differ, ramp};
@@ -418,7 +377,7 @@ fn check_epilogues(simd: Simd) -> Result<(), String> {
     let (columns, rows) = (Tiling::of(simd).columns, 5);
     let block: Vec<f32> = ramp(rows * columns, 6).iter().map(|value| value * 6.0).collect();
     let (bias, before) = (ramp(columns, 7), ramp(rows * (columns + 3), 8));
-    for epilogue in [Epilogue::Bias, Epilogue::BiasGelu, Epilogue::BiasResidual] {
+    for epilogue in Epilogue::ALL {
         let mut out = before.clone();
         finish_block(simd, epilogue, plain(rows, &block, &bias), &mut out, columns + 3);
         for (index, &actual) in out.iter().enumerate() {
@@ -429,31 +388,38 @@ fn check_epilogues(simd: Simd) -> Result<(), String> {
                 let value = f64::from(block[row * columns + column] + bias[column]);
                 match epilogue {
                     Epilogue::Bias => value,
-                    Epilogue::BiasGelu => 0.5 * value * (1.0 + reference_erf(value / std::f64::consts::SQRT_2)),
+                    Epilogue::BiasGelu | Epilogue::BiasShortGelu => {
+                        0.5 * value * (1.0 + reference_erf(value / std::f64::consts::SQRT_2))
+                    }
                     Epilogue::BiasResidual => value + f64::from(before[index]),
                 }
             };
-            if differ(actual, expected, 4e-6) {
+            let tolerance = if epilogue == Epilogue::BiasShortGelu { 1e-4 } else { 4e-6 };
+            if differ(actual, expected, tolerance) {
                 return Err(format!("{epilogue:?} at row {row}, column {column}: {actual} is not {expected}"));
             }
         }
     }
-    if Format::Bf16.is_available(simd) { check_rounded_gelu(simd, &block, rows) } else { Ok(()) }
+    if Format::Bf16.is_available(simd) { check_rounded_epilogues(simd, &block, rows) } else { Ok(()) }
 }
 
-/// GELU in bf16 against the f32 one, rounded here; rows lie apart, and what is between them must stay.
-fn check_rounded_gelu(simd: Simd, block: &[f32], rows: usize) -> Result<(), String> {
+/// Epilogues that end in bf16 against those in f32, rounded here; rows lie apart, and what is between them must stay.
+fn check_rounded_epilogues(simd: Simd, block: &[f32], rows: usize) -> Result<(), String> {
     let columns = Tiling::of(simd).columns;
     let (exact_stride, stride, untouched) = (columns + 3, columns / 2 + 3, 7);
-    let (mut exact, mut rounded) = (vec![0.0; rows * exact_stride], vec![untouched; rows * stride]);
-    finish_block(simd, Epilogue::BiasGelu, plain(rows, block, block), &mut exact, exact_stride);
-    finish_gelu_bf16(simd, plain(rows, block, block), &mut rounded, stride);
-    for (at, &word) in rounded.iter().enumerate() {
-        let (row, column) = (at / stride, 2 * (at % stride));
-        let bits = |column: usize| u32::from(half::bf16::from_f32(exact[row * exact_stride + column]).to_bits());
-        let expected = if column < columns { bits(column) | bits(column + 1) << 16 } else { untouched };
-        if word != expected {
-            return Err(format!("GELU in bf16 at row {row}, column {column}: {word:x} is not {expected:x}"));
+    for epilogue in Epilogue::ALL.into_iter().filter(|&epilogue| epilogue != Epilogue::BiasResidual) {
+        let (mut exact, mut rounded) = (vec![0.0; rows * exact_stride], vec![untouched; rows * stride]);
+        finish_block(simd, epilogue, plain(rows, block, block), &mut exact, exact_stride);
+        finish_words(simd, Format::Bf16, epilogue, plain(rows, block, block), &mut rounded, stride);
+        for (at, &word) in rounded.iter().enumerate() {
+            let (row, column) = (at / stride, 2 * (at % stride));
+            let bits = |column: usize| u32::from(half::bf16::from_f32(exact[row * exact_stride + column]).to_bits());
+            let expected = if column < columns { bits(column) | bits(column + 1) << 16 } else { untouched };
+            if word != expected {
+                return Err(format!(
+                    "{epilogue:?} in bf16 at row {row}, column {column}: {word:x} is not {expected:x}"
+                ));
+            }
         }
     }
     Ok(())

@@ -41,9 +41,6 @@ pub(super) trait Lanes: Copy {
     unsafe fn sum(self) -> f32;
     unsafe fn maximum(self) -> f32;
 
-    /// The first sixteen bits of each number, which are a bf16, the others zero.
-    unsafe fn truncated(self) -> Self;
-
     /// Stores bf16, rounded to the nearest, two to a word: `COUNT / 2` words. At the highest level only where the CPU
     /// has AVX-512 BF16.
     #[inline(always)]
@@ -214,10 +211,6 @@ impl Lanes for Portable {
         self.zip(other, |a, b| a.to_bits().wrapping_sub(b.to_bits()).cast_signed() as f32)
     }
     #[inline(always)]
-    unsafe fn truncated(self) -> Self {
-        Self(self.0.map(|value| f32::from_bits(value.to_bits() & 0xffff_0000)))
-    }
-    #[inline(always)]
     unsafe fn sum(self) -> f32 {
         self.0.iter().sum()
     }
@@ -291,10 +284,6 @@ impl Lanes for Avx2 {
             let (a, b) = (_mm256_castps_si256(self.0), _mm256_castps_si256(other.0));
             Self(_mm256_cvtepi32_ps(_mm256_sub_epi32(a, b)))
         }
-    }
-    #[inline(always)]
-    unsafe fn truncated(self) -> Self {
-        unsafe { Self(_mm256_and_ps(self.0, _mm256_castsi256_ps(_mm256_set1_epi32(0xffff_0000u32.cast_signed())))) }
     }
     #[inline(always)]
     unsafe fn sum(self) -> f32 {
@@ -381,10 +370,6 @@ impl Lanes for Avx512 {
             let (a, b) = (_mm512_castps_si512(self.0), _mm512_castps_si512(other.0));
             Self(_mm512_cvtepi32_ps(_mm512_sub_epi32(a, b)))
         }
-    }
-    #[inline(always)]
-    unsafe fn truncated(self) -> Self {
-        unsafe { Self(_mm512_and_ps(self.0, _mm512_castsi512_ps(_mm512_set1_epi32(0xffff_0000u32.cast_signed())))) }
     }
     #[inline(always)]
     unsafe fn store_bf16(self, to: *mut u32) {

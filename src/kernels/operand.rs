@@ -5,7 +5,6 @@
 
 use super::Simd;
 use super::aligned::AlignedBuffer;
-use super::attention::ScoreFormat;
 use super::gemm::covers;
 #[cfg(target_arch = "x86_64")]
 use super::lanes::{Avx2, Avx512};
@@ -92,15 +91,6 @@ pub struct OperandBuffer {
     factors: AlignedBuffer<f32>,
 }
 
-/// Which side of the scores' product a row is on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ScoreSide {
-    /// Its left-hand side.
-    Query,
-    /// Its right-hand side.
-    Key,
-}
-
 /// Widths that [`OperandBuffer::pack`] takes are multiples of this: a vector's length.
 pub fn width_step(simd: Simd) -> usize {
     if simd.level() >= SimdLevel::Avx512 { 16 } else { 8 }
@@ -137,39 +127,10 @@ impl OperandBuffer {
         Left { rows: Rows { data: &self.words, stride: words }, factors: &self.factors }
     }
 
-    /// Room for `rows` rows of `width` bf16, for an epilogue to fill, a row after the other; [`filled`](Self::filled)
-    /// then gives them.
-    pub fn bf16_rows(&mut self, rows: usize, width: usize) -> &mut [u32] {
-        self.words.resize(rows * Format::Bf16.words(width));
+    /// Room for `rows` rows of `width` numbers in `format`, a row after the other, for an epilogue to fill.
+    pub fn rows(&mut self, format: Format, rows: usize, width: usize) -> &mut [u32] {
+        self.words.resize(rows * format.words(width));
         &mut self.words
-    }
-
-    /// What was put into [`bf16_rows`](Self::bf16_rows).
-    pub fn filled(&self, width: usize) -> Left<'_> {
-        Left { rows: Rows { data: &self.words, stride: Format::Bf16.words(width) }, factors: &[] }
-    }
-
-    /// As [`pack`](Self::pack), for rows of queries or keys, whose order of parts depends on their `side`.
-    ///
-    /// # Panics
-    /// As there.
-    pub fn pack_scores<'a>(
-        &'a mut self,
-        simd: Simd,
-        format: ScoreFormat,
-        side: ScoreSide,
-        (rows, width): (usize, usize),
-        (source, stride): (&'a [f32], usize),
-    ) -> Rows<'a> {
-        if format != ScoreFormat::SplitBf16 {
-            return self.pack(simd, format.product(), rows, width, (source, stride)).rows;
-        }
-        assert_eq!(width % width_step(simd), 0, "rows must be whole vectors wide");
-        assert!(rows == 0 || covers(source.len(), rows, stride, width), "source too short");
-        let words = Format::Bf16.words(width);
-        self.words.resize(rows * 3 * words);
-        split_rows(simd, SourceRows { source: source.as_ptr(), stride, width }, side, &mut self.words);
-        Rows { data: &self.words, stride: 3 * words }
     }
 }
 
@@ -208,39 +169,6 @@ unsafe fn round<V: Lanes>(rows: SourceRows, packed: &mut [u32]) {
         unsafe {
             for at in (0..rows.width).step_by(V::COUNT) {
                 V::load(rows.row(index).add(at)).store_bf16(packed.as_mut_ptr().add(at / 2));
-            }
-        }
-    }
-}
-
-/// Rows of numbers, each as its first sixteen bits and what is left, rounded to as many, in the order of `side`.
-fn split_rows(simd: Simd, rows: SourceRows, side: ScoreSide, packed: &mut [u32]) {
-    at_bf16_level!(
-        simd,
-        (rows: SourceRows = rows, side: ScoreSide = side, packed: &mut [u32] = packed),
-        split::<Portable>(rows, side, packed),
-        split::<Avx2>(rows, side, packed),
-        split::<Avx512>(rows, side, packed),
-    );
-}
-
-#[inline(always)]
-unsafe fn split<V: Lanes>(rows: SourceRows, side: ScoreSide, packed: &mut [u32]) {
-    let words = rows.width / 2;
-    for (index, packed) in packed.chunks_exact_mut(3 * words).enumerate() {
-        // SAFETY: rows are whole vectors and take half as many words, three times.
-        unsafe {
-            for at in (0..rows.width).step_by(V::COUNT) {
-                let value = V::load(rows.row(index).add(at));
-                let greater = value.truncated();
-                let lesser = value.sub(greater);
-                let order = match side {
-                    ScoreSide::Query => [greater, lesser, greater],
-                    ScoreSide::Key => [greater, greater, lesser],
-                };
-                for (part, value) in order.into_iter().enumerate() {
-                    value.store_bf16(packed.as_mut_ptr().add(part * words + at / 2));
-                }
             }
         }
     }

@@ -4,7 +4,7 @@ use super::cuts::{coarsen, limit};
 use super::*;
 use crate::eval::datasets::Item;
 use crate::types::{
-    Descriptor, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid, PoolingStride, ScaleKeyPatches,
+    ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid, PoolingStride, ScaleKeyPatches,
 };
 use half::f16;
 use rand::{RngExt, SeedableRng};
@@ -95,6 +95,14 @@ const FAKE_GRID: PatchGrid = PatchGrid { columns: 12, rows: 8, patch_px: 14, str
 impl Describe for Fake {
     fn model(&self) -> &ModelId {
         &self.model
+    }
+
+    fn computed_by(&self) -> String {
+        "a fake".into()
+    }
+
+    fn fingerprint(&self) -> Result<ContentHash, EvalError> {
+        Ok(ContentHash::of(b"a fake"))
     }
 
     fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String> {

@@ -7,18 +7,27 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 /// Describes an image by its first byte; refuses those that start with `!`.
 struct FirstByte {
     model: ModelId,
+    kernels: &'static [u8],
     described: AtomicUsize,
 }
 
 impl FirstByte {
     fn new(model: &str) -> Self {
-        Self { model: ModelId::new(model), described: AtomicUsize::new(0) }
+        Self { model: ModelId::new(model), kernels: b"first", described: AtomicUsize::new(0) }
     }
 }
 
 impl Describe for FirstByte {
     fn model(&self) -> &ModelId {
         &self.model
+    }
+
+    fn computed_by(&self) -> String {
+        "test".into()
+    }
+
+    fn fingerprint(&self) -> Result<ContentHash, EvalError> {
+        Ok(ContentHash::of(self.kernels))
     }
 
     fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String> {
@@ -97,8 +106,10 @@ fn a_second_run_computes_nothing_and_a_changed_image_only_itself() {
     assert_eq!((second.dim, second.pooled_dim), (3, 3));
     std::fs::write(folder.path().join("b.jpg"), b"c").unwrap();
     assert_eq!(run(&FirstByte::new("m"), folder.path(), &all, GlobalKind::Head).1.fresh, 1);
-    // Another model shares nothing.
+    // Another model shares nothing, nor do kernels that round otherwise.
     assert_eq!(run(&FirstByte::new("n"), folder.path(), &all[1..2], GlobalKind::Head).1.fresh, 1);
+    let rebuilt = FirstByte { kernels: b"second", ..FirstByte::new("m") };
+    assert_eq!(run(&rebuilt, folder.path(), &all[1..2], GlobalKind::Head).1.fresh, 1);
 }
 
 #[test]

@@ -5,10 +5,10 @@ use super::weights::{PackedBlock, PackedLinear};
 use crate::extract::preset::LAYER_NORM_EPS;
 use crate::kernels::Simd;
 use crate::kernels::aligned::AlignedBuffer;
-use crate::kernels::attention::{AttentionShape, Place, attend, store_keys, store_queries, store_values};
-use crate::kernels::elementwise::{Epilogue, Product, finish_block, finish_gelu_bf16, normalize_rows};
+use crate::kernels::attention::{AttentionShape, Place, attend, store_keys, store_values};
+use crate::kernels::elementwise::{Epilogue, Product, finish_block, finish_words, normalize_rows};
 use crate::kernels::gemm::{Tiling, multiply_panel};
-use crate::kernels::operand::{Format, Left, OperandBuffer, ScoreSide};
+use crate::kernels::operand::{Format, Left, OperandBuffer, Rows};
 use std::ops::Range;
 
 /// Width of the slice of the MLP's hidden layer that exists at a time.
@@ -111,28 +111,23 @@ impl ChunkPlan {
     pub fn project(&self, chunk: &mut Chunk<'_>, block: &PackedBlock, scratch: &mut Scratch) {
         let (rows, columns, head_dim) = (self.rows(chunk.index), self.columns(), self.shape.head_dim);
         self.normalize(chunk, rows, scratch);
-        let Scratch { block: sums, input, hidden, packed, packed_block, .. } = scratch;
-        hidden.resize(BLOCK_ROWS * columns);
+        let Scratch { block: sums, input, packed, packed_block, .. } = scratch;
         let left = packed.pack(self.simd, block.qkv.weight.format(), rows, self.dim, (input, self.dim));
         self.linear(rows, left, &block.qkv, sums, |panel, token, product| {
-            finish_block(self.simd, Epilogue::Bias, product, hidden, columns);
+            let (simd, shape) = (self.simd, &self.shape);
             let (part, column) = (panel * columns / self.dim, panel * columns % self.dim);
             let place = Place { head: column / head_dim, dim: column % head_dim, token };
-            let (simd, shape, finished) = (self.simd, &self.shape, (&hidden[..product.rows * columns], columns));
-            let size = (product.rows, columns);
+            if part == 0 {
+                let queries = &mut chunk.queries[shape.query_at(place)..];
+                return finish_words(simd, shape.format, Epilogue::Bias, product, queries, shape.query_len());
+            }
+            let stride = shape.format.words(columns);
+            let finished = packed_block.rows(shape.format, product.rows, columns);
+            finish_words(simd, shape.format, Epilogue::Bias, product, finished, stride);
+            let finished = Rows { data: finished, stride };
             match part {
-                0 => {
-                    let words = packed_block.pack_scores(simd, shape.score_format, ScoreSide::Query, size, finished);
-                    store_queries(shape, place, words, chunk.queries);
-                }
-                1 => {
-                    let words = packed_block.pack_scores(simd, shape.score_format, ScoreSide::Key, size, finished);
-                    store_keys(simd, shape, place, words, chunk.keys);
-                }
-                _ => {
-                    let values = packed_block.pack(simd, shape.mix_format, product.rows, columns, finished);
-                    store_values(simd, shape, place, values.rows, chunk.values);
-                }
+                1 => store_keys(simd, shape, place, finished, chunk.keys),
+                _ => store_values(simd, shape, place, finished, chunk.values),
             }
         });
     }
@@ -167,26 +162,28 @@ impl ChunkPlan {
         let (simd, columns) = (self.simd, self.columns());
         self.normalize(chunk, rows, scratch);
         let Scratch { block: sums, input, hidden, packed, packed_block, .. } = scratch;
-        let (fc1, fc2) = (&block.fc1, &block.fc2);
+        let (fc1, fc2, format) = (&block.fc1, &block.fc2, block.fc2.weight.format());
+        let gelu = if format == Format::F32 { Epilogue::BiasGelu } else { Epilogue::BiasShortGelu };
         let normalized = packed.pack(simd, fc1.weight.format(), rows, self.dim, (input, self.dim));
         for (slice, from) in (0..fc1.weight.n()).step_by(HIDDEN_SLICE).enumerate() {
             let to = fc1.weight.n().min(from + HIDDEN_SLICE);
             let (width, panels) = (to - from, from / columns..to.div_ceil(columns));
-            let left = if fc2.weight.format() == Format::Bf16 {
-                let words = Format::Bf16.words(width);
-                let rounded = packed_block.bf16_rows(rows, width);
-                self.panels((rows, normalized), fc1, 0, panels, sums, |panel, first, product| {
-                    let out = &mut rounded[first * words + Format::Bf16.words(panel * columns - from)..];
-                    finish_gelu_bf16(simd, product, out, words);
-                });
-                packed_block.filled(width)
-            } else {
+            let left = if format == Format::Int8 {
+                // What a code is worth is known when the row is whole.
                 hidden.resize(self.shape.chunk_rows * HIDDEN_SLICE);
                 self.panels((rows, normalized), fc1, 0, panels, sums, |panel, first, product| {
                     let out = &mut hidden[first * HIDDEN_SLICE + panel * columns - from..];
-                    finish_block(simd, Epilogue::BiasGelu, product, out, HIDDEN_SLICE);
+                    finish_block(simd, gelu, product, out, HIDDEN_SLICE);
                 });
-                packed_block.pack(simd, fc2.weight.format(), rows, width, (hidden, HIDDEN_SLICE))
+                packed_block.pack(simd, format, rows, width, (hidden, HIDDEN_SLICE))
+            } else {
+                let words = format.words(width);
+                let finished = packed_block.rows(format, rows, width);
+                self.panels((rows, normalized), fc1, 0, panels, sums, |panel, first, product| {
+                    let out = &mut finished[first * words + format.words(panel * columns - from)..];
+                    finish_words(simd, format, gelu, product, out, words);
+                });
+                Left { rows: Rows { data: finished, stride: words }, factors: &[] }
             };
             self.panels((rows, left), fc2, slice, 0..fc2.weight.panels(), sums, |panel, first, product| {
                 // The bias is added once, with the first slice.

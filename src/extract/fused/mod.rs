@@ -6,8 +6,8 @@
 //! (bias, GELU, residual) while it is in the first-level cache. So a block of the transformer is one parallel loop over
 //! the chunks of all images, and scores and hidden activations never reach memory.
 //!
-//! Products are in f32, in bf16 but for the scores of attention (f32, or bf16 in two parts), or in int8 with bf16
-//! attention; everything between them is f32.
+//! Products are in f32, in bf16, or in int8 with attention in bf16 (f32 where the CPU lacks it); everything between them
+//! is f32.
 //!
 //! No sum depends on how chunks are spread over threads or on other images, so a batch gives bit for bit what single
 //! images give. Buffers are kept between calls; in the steady state only the answer is allocated.
@@ -24,7 +24,7 @@ use super::positions::interpolate;
 use super::preset::{Geometry, LAYER_NORM_EPS};
 use super::weights::{Norm, VitWeights};
 use crate::kernels::aligned::AlignedBuffer;
-use crate::kernels::attention::{AttentionShape, ScoreFormat, chunk_rows, first_row_attention};
+use crate::kernels::attention::{AttentionShape, chunk_rows, first_row_attention};
 use crate::kernels::elementwise::normalize_rows;
 use crate::kernels::gemm::{Readiness, Tiling};
 use crate::kernels::operand::Format;
@@ -92,8 +92,17 @@ impl FusedEncoder {
         simd: Simd,
         precision: Precision,
     ) -> Result<Self, ExtractError> {
+        let chosen = choose_formats(simd, precision)?;
+        Self::with_formats(weights, spec, simd, chosen)
+    }
+
+    fn with_formats(
+        weights: &VitWeights,
+        spec: EncoderSpec,
+        simd: Simd,
+        (precision, formats): (Precision, Formats),
+    ) -> Result<Self, ExtractError> {
         let geometry = weights.geometry;
-        let (precision, formats) = choose_formats(simd, precision)?;
         // Tiles do nothing for f32, and vectors of it are faster without regard to them.
         let simd = if precision == Precision::F32 { simd.at_most(SimdLevel::Avx512) } else { simd };
         let (patch, size) = (geometry.patch, spec.input_size);
@@ -123,8 +132,7 @@ impl FusedEncoder {
         // The embedding adds its bias to every row, the CLS row too.
         positions.iter_mut().zip(&weights.patch_embed.bias).for_each(|(position, bias)| *position -= bias);
         let shape = AttentionShape {
-            score_format: formats.scores,
-            mix_format: formats.mix,
+            format: formats.attention,
             tokens: 1 + grid.len(),
             heads: geometry.heads,
             head_dim: geometry.head_dim(),
@@ -294,10 +302,10 @@ impl FusedEncoder {
 }
 
 /// Formats of all products.
+#[derive(Clone, Copy)]
 struct Formats {
     layers: Format,
-    scores: ScoreFormat,
-    mix: Format,
+    attention: Format,
 }
 
 /// What `precision` comes to at this level; `Auto` is settled.
@@ -309,17 +317,14 @@ fn choose_formats(simd: Simd, precision: Precision) -> Result<(Precision, Format
     let (int8, bf16) = (Format::Int8.is_available(simd), Format::Bf16.is_available(simd));
     match precision {
         Precision::Auto => choose_formats(simd, if simd.has_bf16_dot() { Precision::Bf16 } else { Precision::F32 }),
-        Precision::F32 => Ok((precision, Formats { layers: Format::F32, scores: ScoreFormat::F32, mix: Format::F32 })),
-        Precision::Bf16 if bf16 => {
-            // Scores are exponents: rounded to eight bits, the largest of them lose more than all else together.
-            let scores = if simd.level() == SimdLevel::Amx { ScoreFormat::SplitBf16 } else { ScoreFormat::F32 };
-            Ok((precision, Formats { layers: Format::Bf16, scores, mix: Format::Bf16 }))
-        }
+        Precision::F32 => Ok((precision, Formats { layers: Format::F32, attention: Format::F32 })),
+        Precision::Bf16 if bf16 => Ok((precision, Formats { layers: Format::Bf16, attention: Format::Bf16 })),
         Precision::Bf16 => lacks("AVX-512 BF16"),
-        Precision::Int8 if int8 && bf16 => {
-            Ok((precision, Formats { layers: Format::Int8, scores: ScoreFormat::Bf16, mix: Format::Bf16 }))
+        Precision::Int8 if int8 => {
+            let attention = if bf16 { Format::Bf16 } else { Format::F32 };
+            Ok((precision, Formats { layers: Format::Int8, attention }))
         }
-        Precision::Int8 => lacks("AVX-512 VNNI and BF16"),
+        Precision::Int8 => lacks("AVX-512 VNNI"),
     }
 }
 

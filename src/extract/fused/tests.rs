@@ -93,8 +93,13 @@ fn equals_candle_at_every_level_size_and_exit() {
         let spec = spec(size, exit, norm, attention);
         let image = image(seed as u64, size);
         let expected = &CandleEncoder::new(&weights, &spec).unwrap().encode(std::slice::from_ref(&image)).unwrap()[0];
-        for (simd, precision) in everything() {
-            let fused = FusedEncoder::new(&weights, spec, simd, precision).unwrap();
+        let without_bf16 = Formats { layers: Format::Int8, attention: Format::F32 };
+        let of_old_cpus = Simd::all().filter(|&simd| Format::Int8.is_available(simd));
+        let of_old_cpus = of_old_cpus.map(|simd| (simd, Precision::Int8, without_bf16));
+        let of_this_cpu =
+            everything().map(|(simd, precision)| (simd, precision, choose_formats(simd, precision).unwrap().1));
+        for (simd, precision, formats) in of_this_cpu.chain(of_old_cpus) {
+            let fused = FusedEncoder::with_formats(&weights, spec, simd, (precision, formats)).unwrap();
             let actual = &fused.encode(std::slice::from_ref(&image)).unwrap()[0];
             assert_eq!((actual.grid, actual.dim, actual.heads), (expected.grid, expected.dim, expected.heads));
             let differences = [

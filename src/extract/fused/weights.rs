@@ -3,7 +3,9 @@
 //!
 //! A LayerNorm's scale and shift go into the layer that reads it (W diag(g), b + W s), LayerScale into the layer it
 //! scales (diag(l) W, l b), and the factor log2(e) / sqrt(head_dim) into the query rows, so that scores are exponents of
-//! two. Sums are taken in f64 once; what is left at run time is products, biases, and nothing else.
+//! two. The bias of the keys adds the same to all scores of a query, which softmax takes out again: it is left out. Keys
+//! are that much smaller, and what bf16 loses of a score is no more than what it loses elsewhere. Sums are taken in f64
+//! once; what is left at run time is products, biases, and nothing else.
 
 use crate::extract::weights::{BlockWeights, Linear, Norm};
 use crate::kernels::Simd;
@@ -81,8 +83,10 @@ impl PackedBlock {
         let scale = |layer_scale: &Option<Vec<f32>>, o: usize| layer_scale.as_ref().map_or(1.0, |scale| scale[o]);
         let query = |o: usize| if o < dim { query_scale } else { 1.0 };
         let whole = usize::MAX;
+        let mut qkv = PackedLinear::pack(kernels, &block.qkv, whole, query, Some(&block.norm1));
+        qkv.bias[dim..2 * dim].fill(0.0);
         Self {
-            qkv: PackedLinear::pack(kernels, &block.qkv, whole, query, Some(&block.norm1)),
+            qkv,
             proj: PackedLinear::pack(kernels, &block.proj, whole, |o| scale(&block.layer_scale1, o), None),
             fc1: PackedLinear::pack(kernels, &block.fc1, whole, |_| 1.0, Some(&block.norm2)),
             fc2: PackedLinear::pack(kernels, &block.fc2, hidden_slice, |o| scale(&block.layer_scale2, o), None),
