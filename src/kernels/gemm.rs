@@ -27,6 +27,8 @@ use super::tiles;
 pub struct Tiling {
     /// Rows of the left-hand side.
     pub rows: usize,
+    /// Rows come in multiples of this; those that fill no tile are multiplied so many at a time, which is slower.
+    pub row_step: usize,
     /// Columns of the right-hand side: the width of a panel.
     pub columns: usize,
 }
@@ -35,11 +37,11 @@ impl Tiling {
     /// The tile of a level: as many sums as its registers hold beside one row of the panel.
     pub fn of(simd: Simd) -> Self {
         match simd.level() {
-            SimdLevel::Scalar => Self { rows: 4, columns: 8 },
-            SimdLevel::Avx2 => Self { rows: 6, columns: 16 },
-            SimdLevel::Avx512 => Self { rows: 12, columns: 32 },
+            SimdLevel::Scalar => Self { rows: 4, row_step: 4, columns: 8 },
+            SimdLevel::Avx2 => Self { rows: 6, row_step: 2, columns: 16 },
+            SimdLevel::Avx512 => Self { rows: 12, row_step: 4, columns: 32 },
             // Two matrix registers wide; their height, of which twice as many rows are taken at once where there are.
-            SimdLevel::Amx => Self { rows: 16, columns: 32 },
+            SimdLevel::Amx => Self { rows: 16, row_step: 16, columns: 32 },
         }
     }
 }
@@ -216,7 +218,7 @@ impl Readiness {
     }
 }
 
-/// `out = left x panel` for `rows` rows (a multiple of [`Tiling::rows`]); row `i` of the result is the first `columns`
+/// `out = left x panel` for `rows` rows (a multiple of [`Tiling::row_step`]); row `i` of the result is the first `columns`
 /// elements at `out[i * out_stride]`. Both sides are in `format`; for int8 the results are the bits of i32.
 ///
 /// # Panics
@@ -231,7 +233,7 @@ pub fn multiply_panel(
     out_stride: usize,
 ) {
     let tile = Tiling::of(simd);
-    assert_eq!(rows % tile.rows, 0, "rows must be whole tiles");
+    assert_eq!(rows % tile.row_step, 0, "rows must be whole steps");
     if rows == 0 {
         return;
     }
@@ -258,23 +260,23 @@ pub fn multiply_panel(
         Format::F32 => at_level!(
             simd,
             (job: &TileJob = &job),
-            job.run::<Portable, 4, 1>(),
-            job.run::<Avx2, 6, 2>(),
-            job.run::<Avx512, 12, 2>(),
+            job.run::<Portable, 4, 4, 1>(),
+            job.run::<Avx2, 6, 2, 2>(),
+            job.run::<Avx512, 12, 4, 2>(),
         ),
         Format::Bf16 => at_bf16_level!(
             simd,
             (job: &TileJob = &job),
-            job.run::<PortableBf16, 4, 1>(),
-            job.run::<PortableBf16, 6, 2>(),
-            job.run::<Avx512Bf16, 12, 2>(),
+            job.run::<PortableBf16, 4, 4, 1>(),
+            job.run::<PortableBf16, 6, 2, 2>(),
+            job.run::<Avx512Bf16, 12, 4, 2>(),
         ),
         Format::Int8 => at_level!(
             simd,
             (job: &TileJob = &job),
-            job.run::<PortableInt8, 4, 1>(),
-            job.run::<PortableInt8, 6, 2>(),
-            job.run::<Avx512Int8, 12, 2>(),
+            job.run::<PortableInt8, 4, 4, 1>(),
+            job.run::<PortableInt8, 6, 2, 2>(),
+            job.run::<Avx512Int8, 12, 4, 2>(),
         ),
     }
 }
@@ -338,11 +340,15 @@ impl TileJob {
     }
 
     #[inline(always)]
-    unsafe fn run<D: Dot, const MR: usize, const NV: usize>(&self) {
-        for row in (0..self.rows).step_by(MR) {
-            // SAFETY: `multiply_panel` has checked that MR rows from here lie inside both slices.
-            unsafe {
+    unsafe fn run<D: Dot, const MR: usize, const STEP: usize, const NV: usize>(&self) {
+        let whole = self.rows / MR * MR;
+        // SAFETY: `multiply_panel` has checked that all rows, which are whole steps, lie inside both slices.
+        unsafe {
+            for row in (0..whole).step_by(MR) {
                 self.tile::<D, MR, NV>(self.left.add(row * self.left_stride), self.out.add(row * self.out_stride));
+            }
+            for row in (whole..self.rows).step_by(STEP) {
+                self.tile::<D, STEP, NV>(self.left.add(row * self.left_stride), self.out.add(row * self.out_stride));
             }
         }
     }
@@ -403,7 +409,7 @@ macro_rules! rest {
         #[target_feature(enable = $features)]
         unsafe fn $name(job: &TileJob) {
             // SAFETY: the caller's.
-            unsafe { job.run::<$dot, 8, 2>() }
+            unsafe { job.run::<$dot, 8, 8, 2>() }
         }
     };
 }
@@ -435,7 +441,7 @@ fn compare_with_plain_sums(
     use super::operand::OperandBuffer;
     use super::testing::{differ, ramp};
     let (tile, stride) = (Tiling::of(simd), k + 3);
-    let rows = tiles * tile.rows;
+    let rows = tiles * tile.rows + tile.row_step;
     let (left, right) = (ramp(rows * stride, 1), ramp(k * n, 2));
     let matrix = PackedMatrix::pack(simd, format, (k, n), slice, |row, column| right[row * n + column]);
     let bias = vec![0.25; tile.columns];

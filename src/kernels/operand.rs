@@ -118,11 +118,11 @@ impl OperandBuffer {
         let words = format.words(width);
         self.words.resize(rows * words);
         self.factors.resize(if format == Format::Int8 { rows } else { 0 });
-        let rows = SourceRows { source: source.as_ptr(), stride, width };
+        let source = SourceRows { source: source.as_ptr(), stride, width };
         if format == Format::Bf16 {
-            round_rows(simd, rows, &mut self.words);
+            round_rows(simd, source, &mut self.words);
         } else {
-            quantise_rows(simd, rows, &mut self.words, &mut self.factors);
+            quantise_rows(simd, source, (&mut self.words, words), &mut self.factors);
         }
         Left { rows: Rows { data: &self.words, stride: words }, factors: &self.factors }
     }
@@ -132,6 +132,27 @@ impl OperandBuffer {
         self.words.resize(rows * format.words(width));
         &mut self.words
     }
+}
+
+/// Codes of `factors.len()` rows of `width` f32 as in [`Format::Int8`] on the left, row `i` from `i * stride` of `source` to
+/// `i * out_stride` of `out`, and what a code of each is worth.
+///
+/// # Panics
+/// If a slice is too short, or `width` is not a multiple of [`width_step`].
+pub fn quantise_into(
+    simd: Simd,
+    width: usize,
+    (source, stride): (&[f32], usize),
+    (out, out_stride): (&mut [u32], usize),
+    factors: &mut [f32],
+) {
+    assert_eq!(width % width_step(simd), 0, "rows must be whole vectors wide");
+    if factors.is_empty() {
+        return;
+    }
+    assert!(covers(source.len(), factors.len(), stride, width), "source too short");
+    assert!(covers(out.len(), factors.len(), out_stride, Format::Int8.words(width)), "result too short");
+    quantise_rows(simd, SourceRows { source: source.as_ptr(), stride, width }, (out, out_stride), factors);
 }
 
 /// Checked rows of whole vectors, as many as what is made of them has room for.
@@ -174,22 +195,23 @@ unsafe fn round<V: Lanes>(rows: SourceRows, packed: &mut [u32]) {
     }
 }
 
-/// Codes of rows, the largest magnitude of each becoming 127, and what one is worth.
-fn quantise_rows(simd: Simd, rows: SourceRows, packed: &mut [u32], factors: &mut [f32]) {
+/// Codes of as many rows as there are factors, the largest magnitude of each becoming 127, and what one is worth.
+fn quantise_rows(simd: Simd, rows: SourceRows, (packed, stride): (&mut [u32], usize), factors: &mut [f32]) {
     at_level!(
         simd,
-        (rows: SourceRows = rows, packed: &mut [u32] = packed, factors: &mut [f32] = factors),
-        quantise::<Portable>(rows, packed, factors),
-        quantise::<Avx2>(rows, packed, factors),
-        quantise::<Avx512>(rows, packed, factors),
+        (rows: SourceRows = rows, packed: &mut [u32] = packed, stride: usize = stride, factors: &mut [f32] = factors),
+        quantise::<Portable>(rows, packed, stride, factors),
+        quantise::<Avx2>(rows, packed, stride, factors),
+        quantise::<Avx512>(rows, packed, stride, factors),
     );
 }
 
 #[inline(always)]
-unsafe fn quantise<V: Lanes>(rows: SourceRows, packed: &mut [u32], factors: &mut [f32]) {
-    for ((index, packed), factor) in packed.chunks_exact_mut(rows.width / 4).enumerate().zip(factors) {
-        // SAFETY: rows are whole vectors and take a quarter as many words.
+unsafe fn quantise<V: Lanes>(rows: SourceRows, packed: &mut [u32], stride: usize, factors: &mut [f32]) {
+    for (index, factor) in factors.iter_mut().enumerate() {
+        // SAFETY: rows are whole vectors and take a quarter as many words, for which there is room.
         unsafe {
+            let packed = packed.as_mut_ptr().add(index * stride).cast::<u8>();
             let mut highest = V::splat(0.0);
             for at in (0..rows.width).step_by(V::COUNT) {
                 let value = V::load(rows.row(index).add(at));
@@ -200,7 +222,7 @@ unsafe fn quantise<V: Lanes>(rows: SourceRows, packed: &mut [u32], factors: &mut
             for at in (0..rows.width).step_by(V::COUNT) {
                 // Two roundings, as every level has them: the codes are the same everywhere.
                 let code = V::load(rows.row(index).add(at)).mul(scale).add(centre);
-                code.store_u8(packed.as_mut_ptr().cast::<u8>().add(at));
+                code.store_u8(packed.add(at));
             }
             *factor = largest / 127.0;
         }

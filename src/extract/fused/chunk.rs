@@ -5,7 +5,9 @@ use super::weights::{PackedBlock, PackedLinear};
 use crate::extract::preset::LAYER_NORM_EPS;
 use crate::kernels::Simd;
 use crate::kernels::aligned::AlignedBuffer;
-use crate::kernels::attention::{AttentionShape, Place, attend, store_keys, store_values};
+use crate::kernels::attention::{
+    AttentionShape, Place, attend, store_key_codes, store_keys, store_query_codes, store_values,
+};
 use crate::kernels::elementwise::{Epilogue, Product, finish_block, finish_words, normalize_rows};
 use crate::kernels::gemm::{Tiling, multiply_panel};
 use crate::kernels::operand::{Format, Left, OperandBuffer, Rows};
@@ -35,7 +37,7 @@ pub(super) struct Chunk<'a> {
     pub index: usize,
     /// Tokens, `[chunk_rows, dim]`.
     pub tokens: &'a mut [f32],
-    /// Queries, `[chunk_rows, query_len]`.
+    /// Queries, `queries_len` words.
     pub queries: &'a mut [u32],
     /// Keys for the next block.
     pub keys: &'a mut [u32],
@@ -61,10 +63,10 @@ pub(super) struct Scratch {
 }
 
 impl ChunkPlan {
-    /// Rows of chunk `index` that hold tokens, in whole register tiles.
+    /// Rows of chunk `index` that hold tokens, in whole steps of the products.
     fn rows(&self, index: usize) -> usize {
         let filled = (self.shape.tokens - index * self.shape.chunk_rows).min(self.shape.chunk_rows);
-        filled.next_multiple_of(Tiling::of(self.simd).rows)
+        filled.next_multiple_of(Tiling::of(self.simd).row_step)
     }
 
     fn columns(&self) -> usize {
@@ -111,19 +113,31 @@ impl ChunkPlan {
     pub fn project(&self, chunk: &mut Chunk<'_>, block: &PackedBlock, scratch: &mut Scratch) {
         let (rows, columns, head_dim) = (self.rows(chunk.index), self.columns(), self.shape.head_dim);
         self.normalize(chunk, rows, scratch);
-        let Scratch { block: sums, input, packed, packed_block, .. } = scratch;
+        let Scratch { block: sums, input, hidden, packed, packed_block, .. } = scratch;
+        hidden.resize(self.shape.chunk_rows * head_dim);
         let left = packed.pack(self.simd, block.qkv.weight.format(), rows, self.dim, (input, self.dim));
         self.linear(rows, left, &block.qkv, sums, |panel, token, product| {
             let (simd, shape) = (self.simd, &self.shape);
             let (part, column) = (panel * columns / self.dim, panel * columns % self.dim);
             let place = Place { head: column / head_dim, dim: column % head_dim, token };
+            if part < 2 && shape.scores == Format::Int8 {
+                // What a code is worth is known when the head's last panel is there.
+                let head = &mut hidden[token * head_dim..(token + product.rows) * head_dim];
+                finish_block(simd, Epilogue::Bias, product, &mut head[place.dim..], head_dim);
+                return match part {
+                    _ if place.dim + columns < head_dim => (),
+                    0 => store_query_codes(simd, shape, place, head, chunk.queries),
+                    _ => store_key_codes(simd, shape, place, head, packed_block, chunk.keys),
+                };
+            }
             if part == 0 {
                 let queries = &mut chunk.queries[shape.query_at(place)..];
-                return finish_words(simd, shape.format, Epilogue::Bias, product, queries, shape.query_len());
+                return finish_words(simd, shape.scores, Epilogue::Bias, product, queries, shape.query_len());
             }
-            let stride = shape.format.words(columns);
-            let finished = packed_block.rows(shape.format, product.rows, columns);
-            finish_words(simd, shape.format, Epilogue::Bias, product, finished, stride);
+            let format = if part == 1 { shape.scores } else { shape.mix };
+            let stride = format.words(columns);
+            let finished = packed_block.rows(format, product.rows, columns);
+            finish_words(simd, format, Epilogue::Bias, product, finished, stride);
             let finished = Rows { data: finished, stride };
             match part {
                 1 => store_keys(simd, shape, place, finished, chunk.keys),

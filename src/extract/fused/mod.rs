@@ -6,8 +6,8 @@
 //! (bias, GELU, residual) while it is in the first-level cache. So a block of the transformer is one parallel loop over
 //! the chunks of all images, and scores and hidden activations never reach memory.
 //!
-//! Products are in f32, in bf16, or in int8 with attention in bf16 (f32 where the CPU lacks it); everything between them
-//! is f32.
+//! Products are in f32, or layers in bf16 or int8, and then the scores of attention in int8 (bf16 in matrix registers) and
+//! its mix of values in bf16 (f32 where the CPU lacks it); everything between them is f32.
 //!
 //! No sum depends on how chunks are spread over threads or on other images, so a batch gives bit for bit what single
 //! images give. Buffers are kept between calls; in the steady state only the answer is allocated.
@@ -132,7 +132,8 @@ impl FusedEncoder {
         // The embedding adds its bias to every row, the CLS row too.
         positions.iter_mut().zip(&weights.patch_embed.bias).for_each(|(position, bias)| *position -= bias);
         let shape = AttentionShape {
-            format: formats.attention,
+            scores: formats.scores,
+            mix: formats.mix,
             tokens: 1 + grid.len(),
             heads: geometry.heads,
             head_dim: geometry.head_dim(),
@@ -174,7 +175,7 @@ impl FusedEncoder {
         let shape = &plan.shape;
         let (rows_len, chunks) = (shape.chunk_rows * plan.dim, shape.chunks());
         let (keys_len, values_len) = (shape.keys_len(), shape.values_len());
-        let queries_len = shape.chunk_rows * shape.query_len();
+        let queries_len = shape.queries_len();
         let Workspace { tokens, queries, keys, values, next_keys, next_values, .. } = work;
         tokens.resize(images * chunks * rows_len);
         queries.resize(images * chunks * queries_len);
@@ -287,7 +288,7 @@ impl FusedEncoder {
 
     fn read_attention(&self, shape: &AttentionShape, image: usize, work: &mut Workspace, out: &mut EncodedImage) {
         let simd = self.plan.simd;
-        let queries_len = shape.chunks() * shape.chunk_rows * shape.query_len();
+        let queries_len = shape.chunks() * shape.queries_len();
         let keys_len = shape.chunks() * shape.keys_len();
         let queries = &work.queries[image * queries_len..(image + 1) * queries_len];
         let keys = &work.keys[image * keys_len..(image + 1) * keys_len];
@@ -305,7 +306,8 @@ impl FusedEncoder {
 #[derive(Clone, Copy)]
 struct Formats {
     layers: Format,
-    attention: Format,
+    scores: Format,
+    mix: Format,
 }
 
 /// What `precision` comes to at this level; `Auto` is settled.
@@ -315,15 +317,16 @@ fn choose_formats(simd: Simd, precision: Precision) -> Result<(Precision, Format
         Err(ExtractError::Precision { precision: precision.name(), reason })
     };
     let (int8, bf16) = (Format::Int8.is_available(simd), Format::Bf16.is_available(simd));
+    let mix = if bf16 { Format::Bf16 } else { Format::F32 };
+    // A head's codes lose no more of a score than bf16 does. Where matrix registers multiply bf16, finishing sums of
+    // integers would take as long as it saves.
+    let scores = if int8 && simd.level() < SimdLevel::Amx { Format::Int8 } else { mix };
     match precision {
         Precision::Auto => choose_formats(simd, if simd.has_bf16_dot() { Precision::Bf16 } else { Precision::F32 }),
-        Precision::F32 => Ok((precision, Formats { layers: Format::F32, attention: Format::F32 })),
-        Precision::Bf16 if bf16 => Ok((precision, Formats { layers: Format::Bf16, attention: Format::Bf16 })),
+        Precision::F32 => Ok((precision, Formats { layers: Format::F32, scores: Format::F32, mix: Format::F32 })),
+        Precision::Bf16 if bf16 => Ok((precision, Formats { layers: Format::Bf16, scores, mix })),
         Precision::Bf16 => lacks("AVX-512 BF16"),
-        Precision::Int8 if int8 => {
-            let attention = if bf16 { Format::Bf16 } else { Format::F32 };
-            Ok((precision, Formats { layers: Format::Int8, attention }))
-        }
+        Precision::Int8 if int8 => Ok((precision, Formats { layers: Format::Int8, scores, mix })),
         Precision::Int8 => lacks("AVX-512 VNNI"),
     }
 }

@@ -93,7 +93,7 @@ fn equals_candle_at_every_level_size_and_exit() {
         let spec = spec(size, exit, norm, attention);
         let image = image(seed as u64, size);
         let expected = &CandleEncoder::new(&weights, &spec).unwrap().encode(std::slice::from_ref(&image)).unwrap()[0];
-        let without_bf16 = Formats { layers: Format::Int8, attention: Format::F32 };
+        let without_bf16 = Formats { layers: Format::Int8, scores: Format::Int8, mix: Format::F32 };
         let of_old_cpus = Simd::all().filter(|&simd| Format::Int8.is_available(simd));
         let of_old_cpus = of_old_cpus.map(|simd| (simd, Precision::Int8, without_bf16));
         let of_this_cpu =
