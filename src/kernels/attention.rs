@@ -109,8 +109,9 @@ fn score(
     }
 }
 
-/// Attention of the first `rows` rows (whole steps of [`Tiling`]) of a chunk's `queries`, for one head. `out` is `[rows, ..]` with
-/// row `i` at `i * out_stride` and this head's dimensions first; `keys` and `values` are all chunks of the image.
+/// Attention of the first `rows` rows (whole steps of [`Tiling`]) of a chunk's `queries`, for one head. `out` is
+/// `[rows, ..]` with row `i` at `i * out_stride` and this head's dimensions first; `keys` and `values` are all chunks of
+/// the image.
 ///
 /// # Panics
 /// If a slice is shorter than `shape` says.

@@ -134,8 +134,8 @@ impl OperandBuffer {
     }
 }
 
-/// Codes of `factors.len()` rows of `width` f32 as in [`Format::Int8`] on the left, row `i` from `i * stride` of `source` to
-/// `i * out_stride` of `out`, and what a code of each is worth.
+/// Codes of `factors.len()` rows of `width` f32 as in [`Format::Int8`] on the left, row `i` from `i * stride` of `source`
+/// to `i * out_stride` of `out`, and what a code of each is worth.
 ///
 /// # Panics
 /// If a slice is too short, or `width` is not a multiple of [`width_step`].

@@ -110,7 +110,7 @@ fn equals_candle_at_every_level_size_and_exit() {
             let worst = differences.into_iter().fold(0.0, f32::max);
             // Random weights spread an error over all tokens; what trained ones lose is measured with the real model.
             let (tolerance, least) = match precision {
-                Precision::Bf16 => (0.3, 0.999),
+                Precision::Bf16 => (1.0, 0.999),
                 Precision::Int8 => (2.0, 0.995),
                 _ => (5e-4, 0.999_999),
             };

@@ -171,12 +171,15 @@ pub fn store_key_codes(
 /// Four codes on the left that stand for zero.
 const ZERO_CODES: u32 = 0x8080_8080;
 
+/// A query of zeros, as wide as the tokens of any backbone.
+static ZERO_QUERY: [u32; 512] = [ZERO_CODES; 512];
+
 /// What a query of zeros gives, which is what every query's sums are too high by.
 fn store_offsets(simd: Simd, panel: Panel<'_>, offsets: &mut [u32]) {
-    let (tile, zeros) = (Tiling::of(simd), [ZERO_CODES; 64]);
+    let tile = Tiling::of(simd);
     let mut sums = [0.0; 16 * 32];
     let sums = &mut sums[..tile.row_step * tile.columns];
-    multiply_panel(simd, Format::Int8, tile.row_step, Rows { data: &zeros, stride: 0 }, panel, sums, tile.columns);
+    multiply_panel(simd, Format::Int8, tile.row_step, Rows { data: &ZERO_QUERY, stride: 0 }, panel, sums, tile.columns);
     offsets.copy_from_slice(bytemuck::cast_slice(&sums[..tile.columns]));
 }
 
