@@ -2,9 +2,9 @@
 //!
 //! A record is found by the model's identity, what a fixed picture gives on this machine, and the hash of the image's
 //! content: renaming or copying images costs nothing, changing one image, one setting or one rounding of a kernel
-//! recomputes just what it must. Records are written beside their place
-//! and renamed into it, and carry a checksum: a half-written or damaged one is as good as none. An image that cannot
-//! be read is listed with its reason and takes no part; it never vanishes in silence.
+//! recomputes just what it must. Records are written beside their place and renamed into it, and carry a checksum: a
+//! half-written or damaged one is as good as none. An image that cannot be read is listed with its reason and takes no
+//! part; it never vanishes in silence.
 
 use super::EvalError;
 use super::datasets::Item;

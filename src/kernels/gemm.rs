@@ -218,8 +218,8 @@ impl Readiness {
     }
 }
 
-/// `out = left x panel` for `rows` rows (a multiple of [`Tiling::row_step`]); row `i` of the result is the first `columns`
-/// elements at `out[i * out_stride]`. Both sides are in `format`; for int8 the results are the bits of i32.
+/// `out = left x panel` for `rows` rows (a multiple of [`Tiling::row_step`]); row `i` of the result is the first
+/// `columns` elements at `out[i * out_stride]`. Both sides are in `format`; for int8 the results are the bits of i32.
 ///
 /// # Panics
 /// If a slice is too short for what it is said to hold, or the format is not available at this level.
