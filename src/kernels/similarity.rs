@@ -127,10 +127,8 @@ pub struct PackedColumns {
     codes: Vec<i8>,
     /// AVX2: panels of 16 columns, a line holding two successive values of each.
     pairs: Vec<Line<i16, 32>>,
-    /// AVX-512: panels of 32 columns, two lines holding four successive values of each.
-    quads: Vec<Line<i8, 64>>,
-    /// AVX-512: 128 times the sum of each padded column.
-    offsets: Vec<i32>,
+    /// AVX-512: panels of 32 columns, two lines holding four successive values of each, offset by 128.
+    quads: Vec<Line<u8, 64>>,
     /// One per column; sections padded to whole panels with NaN, which never wins a comparison.
     factors: Vec<f32>,
 }
@@ -145,7 +143,6 @@ impl PackedColumns {
             codes: Vec::new(),
             pairs: Vec::new(),
             quads: Vec::new(),
-            offsets: Vec::new(),
             factors: Vec::new(),
         }
     }
@@ -207,36 +204,27 @@ impl PackedColumns {
 /// What a computation needs besides its input and output; kept to spare allocations.
 #[derive(Debug, Default)]
 pub struct Scratch {
-    /// AVX2: rows widened to i16, sections padded to whole tiles.
+    /// AVX2: rows widened to i16, each padded to whole pairs.
     wide: Vec<i16>,
-    /// AVX-512: rows offset by 128, sections padded to whole tiles.
-    offset: Vec<u8>,
-    /// Factors of the padded rows; NaN in the padding.
-    factors: Vec<f32>,
-    /// Running maxima of each padded row, lane by lane.
+    /// AVX-512: rows padded to whole fours, where they are not as given.
+    padded: Vec<i8>,
+    /// AVX-512: what the sums of each row start from.
+    starts: Vec<i32>,
+    /// Running maxima of each row, lane by lane.
     lane_values: Vec<f32>,
     /// Their columns.
     lane_indices: Vec<i32>,
 }
 
 impl Scratch {
-    fn pad_factors(&mut self, rows: Quantised<'_>, tile: usize) {
-        self.factors.clear();
-        for section in 0..SECTIONS {
-            let start = rows.start(section);
-            self.factors.extend_from_slice(&rows.factors[start..start + rows.counts[section]]);
-            self.factors.resize(self.factors.len().next_multiple_of(tile), f32::NAN);
-        }
-    }
-
-    fn reset_lanes(&mut self, lanes: usize) {
+    fn reset_lanes(&mut self, rows: usize, lanes: usize) {
         self.lane_values.clear();
-        self.lane_values.resize(self.factors.len() * lanes, f32::NEG_INFINITY);
+        self.lane_values.resize(rows * lanes, f32::NEG_INFINITY);
         self.lane_indices.clear();
-        self.lane_indices.resize(self.factors.len() * lanes, -1);
+        self.lane_indices.resize(rows * lanes, -1);
     }
 
-    /// The best over the lanes of padded row `row`, ties to the lowest column.
+    /// The best over the lanes of `row`, ties to the lowest column.
     #[inline(always)]
     fn reduce_lanes(&self, row: usize, lanes: usize) -> Best {
         let lane = row * lanes..(row + 1) * lanes;

@@ -12,6 +12,8 @@ use std::arch::x86_64::*;
 const PANEL: usize = 16;
 /// Rows of a tile: 6 x 2 accumulators, two column vectors, a row value and a product fill the 16 registers.
 const TILE: usize = 6;
+/// Rows of a tile where fewer than [`TILE`] are left.
+const STEP: usize = 2;
 
 /// Lays columns out in panels: line `k` holds values `2k` and `2k + 1` of 16 columns.
 pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
@@ -35,24 +37,17 @@ pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
     }
 }
 
-/// Widens the rows to i16, each padded to an even length, sections padded to whole tiles.
+/// Widens the rows to i16, each padded to an even length.
 #[target_feature(enable = "avx2")]
 fn widen(rows: Quantised<'_>, scratch: &mut Scratch) {
-    let stride = rows.dim.next_multiple_of(2);
-    scratch.pad_factors(rows, TILE);
     scratch.wide.clear();
-    for section in 0..SECTIONS {
-        let start = rows.start(section);
-        let codes = &rows.codes[start * rows.dim..(start + rows.counts[section]) * rows.dim];
-        if stride == rows.dim {
-            scratch.wide.extend(codes.iter().map(|&code| i16::from(code)));
-        } else {
-            for row in codes.chunks_exact(rows.dim) {
-                scratch.wide.extend(row.iter().map(|&code| i16::from(code)));
-                scratch.wide.push(0);
-            }
+    if rows.dim.is_multiple_of(2) {
+        scratch.wide.extend(rows.codes.iter().map(|&code| i16::from(code)));
+    } else {
+        for row in rows.codes.chunks_exact(rows.dim) {
+            scratch.wide.extend(row.iter().map(|&code| i16::from(code)));
+            scratch.wide.push(0);
         }
-        scratch.wide.resize(scratch.wide.len().next_multiple_of(TILE * stride), 0);
     }
 }
 
@@ -66,25 +61,25 @@ pub(super) fn block_maxima(
     out: &mut BlockMaxima,
 ) {
     // SAFETY: this function has the level's instructions.
-    unsafe { driver::block_maxima::<Avx2, TILE>(columns, rows, wanted, scratch, out) }
+    unsafe { driver::block_maxima::<Avx2, TILE, STEP>(columns, rows, wanted, scratch, out) }
 }
 
 struct Avx2;
 
-impl Level<TILE> for Avx2 {
+impl Level for Avx2 {
     type Code = i16;
     type Line = Line<i16, 32>;
     type Floats = lanes::Avx2;
     type Integers = __m256i;
 
     #[inline(always)]
-    unsafe fn pad(rows: Quantised<'_>, scratch: &mut Scratch) {
+    unsafe fn lay_out(rows: Quantised<'_>, scratch: &mut Scratch) {
         // SAFETY: the caller vouches for AVX2.
         unsafe { widen(rows, scratch) }
     }
 
     #[inline(always)]
-    fn padded(scratch: &Scratch) -> &[i16] {
+    fn rows<'a>(_: Quantised<'a>, scratch: &'a Scratch) -> &'a [i16] {
         &scratch.wide
     }
 
@@ -99,38 +94,44 @@ impl Level<TILE> for Avx2 {
     }
 
     #[inline(always)]
-    unsafe fn excess(_: &PackedColumns, _: usize) -> [__m256i; 2] {
+    unsafe fn start(_: &Scratch, _: usize) -> __m256i {
         // SAFETY: the caller vouches for AVX2.
-        unsafe { [_mm256_setzero_si256(); 2] }
+        unsafe { _mm256_setzero_si256() }
     }
 
     #[inline(always)]
-    unsafe fn products(rows: *const i16, stride: usize, panel: &[Self::Line]) -> [[__m256i; 2]; TILE] {
-        // SAFETY: the caller vouches for AVX2.
-        let mut sums = unsafe { [[_mm256_setzero_si256(); 2]; TILE] };
+    unsafe fn add_products<const ROWS: usize, const VECTORS: usize>(
+        rows: *const i16,
+        panel: &[Self::Line],
+        sums: &mut [[__m256i; VECTORS]; ROWS],
+    ) {
+        const { assert!(ROWS <= TILE && VECTORS <= 2) };
+        let stride = 2 * panel.len();
         for (k, line) in panel.iter().enumerate() {
             // SAFETY: a line holds 64 bytes; row `r` has values up to `stride`, and 2k + 1 < stride.
             unsafe {
                 let columns = line.0.as_ptr().cast::<__m256i>();
-                let (left, right) = (_mm256_load_si256(columns), _mm256_load_si256(columns.add(1)));
                 // Written out: with a loop over rows the compiler keeps the sums in memory.
                 macro_rules! rows {
                     ($($r:literal)*) => {$(
-                        let pair = _mm256_set1_epi32(rows.add($r * stride + 2 * k).cast::<i32>().read_unaligned());
-                        sums[$r][0] = _mm256_add_epi32(sums[$r][0], _mm256_madd_epi16(pair, left));
-                        sums[$r][1] = _mm256_add_epi32(sums[$r][1], _mm256_madd_epi16(pair, right));
+                        if $r < ROWS {
+                            let pair = _mm256_set1_epi32(rows.add($r * stride + 2 * k).cast::<i32>().read_unaligned());
+                            for vector in 0..VECTORS {
+                                let column = _mm256_load_si256(columns.add(vector));
+                                sums[$r][vector] = _mm256_add_epi32(sums[$r][vector], _mm256_madd_epi16(pair, column));
+                            }
+                        }
                     )*};
                 }
                 rows!(0 1 2 3 4 5);
             }
         }
-        sums
     }
 
     #[inline(always)]
-    unsafe fn exact(products: __m256i, _: __m256i) -> lanes::Avx2 {
+    unsafe fn to_floats(sums: __m256i) -> lanes::Avx2 {
         // SAFETY: the caller vouches for AVX2.
-        lanes::Avx2(unsafe { _mm256_cvtepi32_ps(products) })
+        lanes::Avx2(unsafe { _mm256_cvtepi32_ps(sums) })
     }
 
     #[inline(always)]

@@ -1,7 +1,7 @@
 //! AVX-512 VNNI: tiles of 12 rows by 32 columns, products by `vpdpbusd`.
 //!
-//! The instruction multiplies unsigned by signed bytes, so rows are offset by 128 and 128 times each column's sum is
-//! taken off again. Written on a CPU without it: [`super::check`] must pass before this level is used.
+//! The instruction multiplies unsigned by signed bytes, so columns are offset by 128, once for all candidates, and sums
+//! start at -128 times that of a row's codes. Written on a CPU without it: [`super::check`] must pass before this level is used.
 
 use super::driver::{self, Level};
 use super::{BlockMaxima, Blocks, Line, PackedColumns, Quantised, SECTIONS, Scratch};
@@ -12,7 +12,12 @@ use std::arch::x86_64::*;
 const PANEL: usize = 32;
 /// Rows of a tile: 12 x 2 accumulators of the 32 registers.
 const TILE: usize = 12;
+/// Rows of a tile where fewer than [`TILE`] are left.
+const STEP: usize = 4;
 const LANES: usize = 16;
+
+/// What makes a signed code an unsigned one: added, or as the highest bit turned around.
+const OFFSET: u8 = 128;
 
 /// Lays columns out in panels: lines `2k` and `2k + 1` hold values `4k..4k + 4` of the first and last 16 columns.
 pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
@@ -20,9 +25,7 @@ pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
     let depth = dim.div_ceil(4);
     packed.pack_factors(columns, PANEL);
     packed.quads.clear();
-    packed.quads.resize(packed.factors.len() / PANEL * depth * 2, Line([0; 64]));
-    packed.offsets.clear();
-    packed.offsets.resize(packed.factors.len(), 0);
+    packed.quads.resize(packed.factors.len() / PANEL * depth * 2, Line([OFFSET; 64]));
     let mut panel_base = 0;
     for section in 0..SECTIONS {
         for local in 0..columns.counts[section] {
@@ -30,30 +33,41 @@ pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
             let (panel, column) = (panel_base + local / PANEL, local % PANEL);
             let lines = &mut packed.quads[panel * depth * 2..][..depth * 2];
             for (pair, quad) in lines.chunks_exact_mut(2).zip(codes.chunks(4)) {
-                pair[column / LANES].0[column % LANES * 4..][..quad.len()].copy_from_slice(quad);
+                for (slot, &code) in pair[column / LANES].0[column % LANES * 4..].iter_mut().zip(quad) {
+                    *slot = code as u8 ^ OFFSET;
+                }
             }
-            packed.offsets[panel * PANEL + column] = 128 * codes.iter().map(|&code| i32::from(code)).sum::<i32>();
         }
         panel_base += columns.counts[section].div_ceil(PANEL);
     }
 }
 
-/// Offsets the rows by 128, each padded to a multiple of four values, sections padded to whole tiles.
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-fn offset(rows: Quantised<'_>, scratch: &mut Scratch) {
-    let stride = rows.dim.next_multiple_of(4);
-    scratch.pad_factors(rows, TILE);
-    scratch.offset.clear();
-    for section in 0..SECTIONS {
-        let start = rows.start(section);
-        let codes = &rows.codes[start * rows.dim..(start + rows.counts[section]) * rows.dim];
-        for row in codes.chunks_exact(rows.dim) {
-            scratch.offset.extend(row.iter().map(|&code| code as u8 ^ 128));
-            // Meets zeros of the columns, so that any value does.
-            scratch.offset.resize(scratch.offset.len().next_multiple_of(stride), 128);
+/// Sums of the rows, from which follows what the offset of the columns adds to a product; and the rows padded to whole
+/// fours, if need be.
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni")]
+fn lay_out(rows: Quantised<'_>, scratch: &mut Scratch) {
+    scratch.starts.clear();
+    scratch.starts.extend(rows.codes.chunks_exact(rows.dim).map(|row| -i32::from(OFFSET) * sum(row)));
+    scratch.padded.clear();
+    if !rows.dim.is_multiple_of(4) {
+        for row in rows.codes.chunks_exact(rows.dim) {
+            scratch.padded.extend_from_slice(row);
+            scratch.padded.resize(scratch.padded.len().next_multiple_of(4), 0);
         }
-        scratch.offset.resize(scratch.offset.len().next_multiple_of(TILE * stride), 128);
     }
+}
+
+/// The sum of a row's codes: its product with ones.
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni")]
+fn sum(row: &[i8]) -> i32 {
+    let (whole, rest) = row.as_chunks::<64>();
+    let ones = _mm512_set1_epi8(1);
+    let add = |sums, codes: &[i8; 64]| {
+        // SAFETY: the array holds 64 bytes, and this function has the instructions.
+        unsafe { _mm512_dpbusd_epi32(sums, ones, _mm512_loadu_si512(codes.as_ptr().cast())) }
+    };
+    _mm512_reduce_add_epi32(whole.iter().fold(_mm512_setzero_si512(), add))
+        + rest.iter().map(|&code| i32::from(code)).sum::<i32>()
 }
 
 /// See [`super::block_maxima`], which has checked the lengths.
@@ -66,26 +80,26 @@ pub(super) fn block_maxima(
     out: &mut BlockMaxima,
 ) {
     // SAFETY: this function has the level's instructions.
-    unsafe { driver::block_maxima::<Avx512, TILE>(columns, rows, wanted, scratch, out) }
+    unsafe { driver::block_maxima::<Avx512, TILE, STEP>(columns, rows, wanted, scratch, out) }
 }
 
 struct Avx512;
 
-impl Level<TILE> for Avx512 {
-    type Code = u8;
-    type Line = Line<i8, 64>;
+impl Level for Avx512 {
+    type Code = i8;
+    type Line = Line<u8, 64>;
     type Floats = lanes::Avx512;
     type Integers = __m512i;
 
     #[inline(always)]
-    unsafe fn pad(rows: Quantised<'_>, scratch: &mut Scratch) {
+    unsafe fn lay_out(rows: Quantised<'_>, scratch: &mut Scratch) {
         // SAFETY: the caller vouches for AVX-512.
-        unsafe { offset(rows, scratch) }
+        unsafe { lay_out(rows, scratch) }
     }
 
     #[inline(always)]
-    fn padded(scratch: &Scratch) -> &[u8] {
-        &scratch.offset
+    fn rows<'a>(rows: Quantised<'a>, scratch: &'a Scratch) -> &'a [i8] {
+        if rows.dim.is_multiple_of(4) { rows.codes } else { &scratch.padded }
     }
 
     #[inline(always)]
@@ -99,39 +113,43 @@ impl Level<TILE> for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn excess(columns: &PackedColumns, panel: usize) -> [__m512i; 2] {
-        let offsets = columns.offsets[panel * PANEL..][..PANEL].as_ptr();
-        // SAFETY: the slice holds 32 values; the caller vouches for AVX-512.
-        unsafe { [Self::load_indices(offsets), Self::load_indices(offsets.add(LANES))] }
+    unsafe fn start(scratch: &Scratch, row: usize) -> __m512i {
+        // SAFETY: the caller vouches for AVX-512.
+        unsafe { _mm512_set1_epi32(scratch.starts[row]) }
     }
 
     #[inline(always)]
-    unsafe fn products(rows: *const u8, stride: usize, panel: &[Self::Line]) -> [[__m512i; 2]; TILE] {
-        // SAFETY: the caller vouches for AVX-512.
-        let mut sums = unsafe { [[_mm512_setzero_si512(); 2]; TILE] };
+    unsafe fn add_products<const ROWS: usize, const VECTORS: usize>(
+        rows: *const i8,
+        panel: &[Self::Line],
+        sums: &mut [[__m512i; VECTORS]; ROWS],
+    ) {
+        const { assert!(ROWS <= TILE && VECTORS <= 2) };
+        let stride = 2 * panel.len();
         for (k, lines) in panel.chunks_exact(2).enumerate() {
             // SAFETY: a line holds 64 bytes; row `r` has bytes up to `stride`, and 4k + 3 < stride.
             unsafe {
-                let left = _mm512_load_si512(lines[0].0.as_ptr().cast());
-                let right = _mm512_load_si512(lines[1].0.as_ptr().cast());
                 // Written out: with a loop over rows the compiler keeps the sums in memory.
                 macro_rules! rows {
                     ($($r:literal)*) => {$(
-                        let quad = _mm512_set1_epi32(rows.add($r * stride + 4 * k).cast::<i32>().read_unaligned());
-                        sums[$r][0] = _mm512_dpbusd_epi32(sums[$r][0], quad, left);
-                        sums[$r][1] = _mm512_dpbusd_epi32(sums[$r][1], quad, right);
+                        if $r < ROWS {
+                            let quad = _mm512_set1_epi32(rows.add($r * stride + 4 * k).cast::<i32>().read_unaligned());
+                            for vector in 0..VECTORS {
+                                let column = _mm512_load_si512(lines[vector].0.as_ptr().cast());
+                                sums[$r][vector] = _mm512_dpbusd_epi32(sums[$r][vector], column, quad);
+                            }
+                        }
                     )*};
                 }
                 rows!(0 1 2 3 4 5 6 7 8 9 10 11);
             }
         }
-        sums
     }
 
     #[inline(always)]
-    unsafe fn exact(products: __m512i, excess: __m512i) -> lanes::Avx512 {
+    unsafe fn to_floats(sums: __m512i) -> lanes::Avx512 {
         // SAFETY: the caller vouches for AVX-512.
-        lanes::Avx512(unsafe { _mm512_cvtepi32_ps(_mm512_sub_epi32(products, excess)) })
+        lanes::Avx512(unsafe { _mm512_cvtepi32_ps(sums) })
     }
 
     #[inline(always)]
