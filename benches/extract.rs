@@ -63,7 +63,7 @@ fn extract(criterion: &mut Criterion) {
         let precisions = if simd == Simd::SCALAR {
             &[Precision::F32][..]
         } else {
-            &[Precision::F32, Precision::Bf16, Precision::Int8][..]
+            &[Precision::F32, Precision::Bf16, Precision::Mixed, Precision::Int8][..]
         };
         for encoder in precisions.iter().copied().filter_map(of_level) {
             encoders.push(Box::new(encoder));

@@ -100,7 +100,8 @@ pub struct ModelOverrides {
     /// Projection to the global descriptor: default, or a file.
     #[arg(long, value_name = "HEAD")]
     pub head: Option<HeadChoice>,
-    /// Arithmetic of the transformer: auto (bf16 where the CPU has it, else f32), f32, bf16 or int8.
+    /// Arithmetic of the transformer: f32, bf16, int8, mixed (int8 in the blocks where it shows least, bf16 in the
+    /// others), or auto (mixed where the CPU has AVX-512 VNNI, else f32).
     #[arg(long, value_name = "NAME")]
     pub precision: Option<Precision>,
 }

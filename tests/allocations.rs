@@ -70,7 +70,7 @@ fn extraction_allocates_its_answer() {
     let input_size = ImageSize { width: 280, height: 210 };
     let spec = EncoderSpec { input_size, exit_block: 2, token_norm: false, attention_block: 2 };
     let image = ImageTensor { size: input_size, data: vec![0.3; 3 * 280 * 210] };
-    for precision in [Precision::F32, Precision::Bf16, Precision::Int8] {
+    for precision in [Precision::F32, Precision::Bf16, Precision::Mixed, Precision::Int8] {
         let Ok(encoder) = FusedEncoder::new(&weights(geometry), spec, Simd::best(), precision) else {
             println!("{precision} is not to be had on this CPU");
             assert_ne!(precision, Precision::F32);

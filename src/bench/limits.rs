@@ -1,5 +1,6 @@
 //! What this machine reaches at most, on all threads at once.
 
+use crate::extract::mixed_int8_blocks;
 use crate::kernels::{Simd, peak};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -37,14 +38,18 @@ impl Limits {
         }
     }
 
-    /// What the layers and the attention of an encoder of this name can reach: its name tells its precision
-    /// (`fused-bf16-avx512`). Half of attention, the scores, is at int8 unless there are matrix registers, the rest at
-    /// bf16 where the CPU has it.
-    pub(super) fn encoder_giga_operations(&self, encoder: &str) -> (f64, f64) {
+    /// What the layers and the attention of an encoder of this name and so many blocks can reach: its name tells its
+    /// precision (`fused-bf16-avx512`). Half of attention, the scores, is at int8 unless there are matrix registers, the
+    /// rest at bf16 where the CPU has it.
+    pub(super) fn encoder_giga_operations(&self, encoder: &str, blocks: usize) -> (f64, f64) {
         let (bf16, int8) = (self.bf16_gflops.unwrap_or(self.f32_gflops), self.int8_gops.unwrap_or(self.f32_gflops));
         let attention = if encoder.contains("amx") { bf16 } else { 2.0 / (1.0 / int8 + 1.0 / bf16) };
         match () {
             () if encoder.contains("int8") => (int8, attention),
+            () if encoder.contains("mixed") => {
+                let coarse = mixed_int8_blocks(blocks).len() as f64 / blocks as f64;
+                (1.0 / (coarse / int8 + (1.0 - coarse) / bf16), attention)
+            }
             () if encoder.contains("bf16") => (bf16, attention),
             () => (self.f32_gflops, self.f32_gflops),
         }

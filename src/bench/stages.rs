@@ -25,12 +25,13 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 /// The rows there are, in the order they are measured. `search_10m` takes 14 GB and runs only when it is named.
-pub const NAMES: [&str; 18] = [
+pub const NAMES: [&str; 19] = [
     "decode_resize_1080p",
     "extract",
     "extract_batch8",
     "extract_f32",
     "extract_bf16",
+    "extract_mixed",
     "extract_int8",
     "load_100",
     "rerank_100",
@@ -142,6 +143,7 @@ impl Bench {
             "extract_batch8" => self.extract(name, self.extractor.config().precision, 8),
             "extract_f32" => self.extract(name, Precision::F32, 1),
             "extract_bf16" => self.extract(name, Precision::Bf16, 1),
+            "extract_mixed" => self.extract(name, Precision::Mixed, 1),
             "extract_int8" => self.extract(name, Precision::Int8, 1),
             "load_100" => self.load(),
             "rerank_100" => self.rerank("rerank_100", 0.4),
@@ -188,7 +190,7 @@ impl Bench {
     /// Milliseconds that an encoder of this name takes for one image at least.
     fn encode_limit_ms(&self, encoder: &str) -> f64 {
         let (layers, attention) = encoder_operations(&self.weights.geometry, &self.spec);
-        let (of_layers, of_attention) = self.limits.encoder_giga_operations(encoder);
+        let (of_layers, of_attention) = self.limits.encoder_giga_operations(encoder, self.spec.blocks());
         Limits::milliseconds(layers, of_layers) + Limits::milliseconds(attention, of_attention)
     }
 

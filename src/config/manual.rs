@@ -118,7 +118,8 @@ pub(super) const SECTIONS: &[(&str, Keys)] = &[
             ),
             (
                 "precision",
-                "Arithmetic of the transformer: auto (bf16 where the CPU has it, else f32), f32, bf16 or int8.",
+                "Arithmetic of the transformer: f32, bf16, int8, mixed (int8 in the blocks where it shows least, bf16 in the\n\
+                 others), or auto (mixed where the CPU has AVX-512 VNNI, else f32).",
             ),
         ],
     ),

@@ -36,7 +36,7 @@ pub use config::{ExtractConfig, HeadChoice};
 pub use encoder::{EncodedImage, Encoder, EncoderSpec, Precision, TokenGrid, check_image, token_grid};
 pub use error::ExtractError;
 pub use extractor::{Extractor, build_encoder};
-pub use fused::FusedEncoder;
+pub use fused::{FusedEncoder, mixed_int8_blocks};
 pub use fusion::{attention_map, average_pool};
 pub use global::{l2_normalise, mean_token, squared_distance};
 pub use head::Head;

@@ -54,6 +54,22 @@ struct Block {
     layer_scale2: Option<Tensor>,
 }
 
+/// A linear layer of a block.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum BlockLayer {
+    /// Queries, keys and values.
+    Qkv,
+    /// Projection of what attention mixed.
+    Proj,
+    /// Into the hidden layer of the MLP.
+    Fc1,
+    /// Out of it.
+    Fc2,
+}
+
+/// What a layer of a block is given, by number of the block.
+type Record<'a> = &'a mut dyn FnMut(usize, BlockLayer, &Tensor) -> Result<()>;
+
 /// What one pass leaves behind.
 struct Pass {
     /// `[1 + n, d]`, of the exit block.
@@ -82,7 +98,24 @@ impl CandleEncoder {
         })
     }
 
-    fn run(&self, image: &ImageTensor) -> Result<Pass> {
+    /// Runs the transformer for what goes into its linear layers: `record(block, layer, inputs)`, `[1 + n, width]`.
+    ///
+    /// # Errors
+    /// The image's size, or candle's.
+    pub(super) fn record_inputs(
+        &self,
+        image: &ImageTensor,
+        record: &mut dyn FnMut(usize, BlockLayer, &[f32]),
+    ) -> std::result::Result<(), ExtractError> {
+        check_image(image, &self.spec)?;
+        self.run(image, &mut |block, layer, inputs| {
+            record(block, layer, &inputs.flatten_all()?.to_vec1::<f32>()?);
+            Ok(())
+        })?;
+        Ok(())
+    }
+
+    fn run(&self, image: &ImageTensor, record: Record<'_>) -> Result<Pass> {
         let patches = tensor(&self.patches(image), &[self.grid.len(), 3 * self.geometry.patch * self.geometry.patch])?;
         let embedded = (self.patch_embed.forward(&patches)? + &self.positions)?;
         let mut x = Tensor::cat(&[&self.cls, &embedded], 0)?;
@@ -93,7 +126,7 @@ impl CandleEncoder {
                 cls_attention = Some(block.cls_attention(&x, &self.geometry)?);
                 break;
             }
-            let (next, attention) = block.forward(&x, &self.geometry)?;
+            let (next, attention) = block.forward(&x, &self.geometry, &mut |layer, inputs| record(i, layer, inputs))?;
             x = next;
             if i == self.spec.attention_block {
                 cls_attention = Some(attention);
@@ -144,7 +177,7 @@ impl Encoder for CandleEncoder {
         images
             .iter()
             .map(|image| {
-                let pass = self.run(image)?;
+                let pass = self.run(image, &mut |_, _, _| Ok(()))?;
                 let mut tokens = pass.tokens.flatten_all()?.to_vec1::<f32>()?;
                 let cls_token = tokens.drain(..self.geometry.dim).collect();
                 Ok(EncodedImage {
@@ -176,29 +209,40 @@ impl Block {
         })
     }
 
-    /// The block's output `[1 + n, d]` and its CLS attention `[heads, n]`.
-    fn forward(&self, x: &Tensor, geometry: &Geometry) -> Result<(Tensor, Tensor)> {
+    /// The block's output `[1 + n, d]` and its CLS attention `[heads, n]`; `record` sees what its layers are given.
+    fn forward(
+        &self,
+        x: &Tensor,
+        geometry: &Geometry,
+        record: &mut dyn FnMut(BlockLayer, &Tensor) -> Result<()>,
+    ) -> Result<(Tensor, Tensor)> {
         let (length, dim) = x.dims2()?;
-        let [q, k, v] = self.queries_keys_values(x, geometry)?;
+        let normed = self.norm1.forward(x)?;
+        record(BlockLayer::Qkv, &normed)?;
+        let [q, k, v] = self.queries_keys_values(&normed, geometry)?;
         let attention = softmax_last_dim(&q.matmul(&k)?)?;
         let mixed = attention.matmul(&v)?.transpose(0, 1)?.reshape((length, dim))?;
+        record(BlockLayer::Proj, &mixed)?;
         let x = residual(x, self.proj.forward(&mixed)?, &self.layer_scale1)?;
-        let hidden = self.fc1.forward(&self.norm2.forward(&x)?)?;
+        let normed = self.norm2.forward(&x)?;
+        record(BlockLayer::Fc1, &normed)?;
+        let hidden = self.fc1.forward(&normed)?;
         hidden.inplace_op1(&Gelu)?;
+        record(BlockLayer::Fc2, &hidden)?;
         let x = residual(&x, self.fc2.forward(&hidden)?, &self.layer_scale2)?;
         Ok((x, patch_keys(&attention)?))
     }
 
     /// The CLS attention `[heads, n]` alone.
     fn cls_attention(&self, x: &Tensor, geometry: &Geometry) -> Result<Tensor> {
-        let [q, k, _] = self.queries_keys_values(x, geometry)?;
+        let [q, k, _] = self.queries_keys_values(&self.norm1.forward(x)?, geometry)?;
         patch_keys(&softmax_last_dim(&q.narrow(1, 0, 1)?.contiguous()?.matmul(&k)?)?)
     }
 
     /// Scaled queries `[heads, length, d / heads]`, keys transposed `[heads, d / heads, length]`, values as queries.
-    fn queries_keys_values(&self, x: &Tensor, geometry: &Geometry) -> Result<[Tensor; 3]> {
-        let (length, dim) = x.dims2()?;
-        let fused = self.qkv.forward(&self.norm1.forward(x)?)?;
+    fn queries_keys_values(&self, normed: &Tensor, geometry: &Geometry) -> Result<[Tensor; 3]> {
+        let (length, dim) = normed.dims2()?;
+        let fused = self.qkv.forward(normed)?;
         let part = |index: usize| {
             fused.narrow(1, index * dim, dim)?.reshape((length, geometry.heads, geometry.head_dim()))?.transpose(0, 1)
         };

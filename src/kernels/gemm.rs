@@ -107,7 +107,10 @@ impl PackedMatrix {
 
     fn pack_column(&mut self, column: usize, words: usize, values: &[f32]) {
         let largest = values.iter().fold(f32::MIN_POSITIVE * 256.0, |a, b| a.max(b.abs()));
-        let code = |value: f32| (value / largest * 127.0).round_ties_even() as i8;
+        // Rounds to the nearest, ties to even, like `round_ties_even`, which is a call where SSE4.1 is not a given: beyond
+        // 2^23 floats have no fraction left.
+        const TO_WHOLE: f32 = 12_582_912.0;
+        let code = |value: f32| (value / largest * 127.0 + TO_WHOLE - TO_WHOLE) as i8;
         let place = column / self.columns * words * self.columns + column % self.columns;
         for (word, numbers) in values.chunks_exact(self.format.per_word()).enumerate() {
             self.data[place + word * self.columns] = match *numbers {

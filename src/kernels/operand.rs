@@ -108,21 +108,35 @@ impl OperandBuffer {
         format: Format,
         rows: usize,
         width: usize,
+        source: (&'a [f32], usize),
+    ) -> Left<'a> {
+        self.pack_scaled(simd, format, rows, width, source, Channels::default())
+    }
+
+    /// The same; what becomes codes goes through `channels` first.
+    ///
+    /// # Panics
+    /// As [`pack`](Self::pack), and if there are channels but not as many as columns.
+    pub fn pack_scaled<'a>(
+        &'a mut self,
+        simd: Simd,
+        format: Format,
+        rows: usize,
+        width: usize,
         (source, stride): (&'a [f32], usize),
+        channels: Channels<'_>,
     ) -> Left<'a> {
         if format == Format::F32 {
             return Left { rows: Rows::f32(source, stride), factors: &[] };
         }
-        assert_eq!(width % width_step(simd), 0, "rows must be whole vectors wide");
-        assert!(rows == 0 || covers(source.len(), rows, stride, width), "source too short");
+        let checked = SourceRows::new(simd, (source, stride), rows, width);
         let words = format.words(width);
         self.words.resize(rows * words);
         self.factors.resize(if format == Format::Int8 { rows } else { 0 });
-        let source = SourceRows { source: source.as_ptr(), stride, width };
         if format == Format::Bf16 {
-            round_rows(simd, source, &mut self.words);
+            round_rows(simd, checked, &mut self.words);
         } else {
-            quantise_rows(simd, source, (&mut self.words, words), &mut self.factors);
+            quantise_rows(simd, checked, channels, (&mut self.words, words), &mut self.factors);
         }
         Left { rows: Rows { data: &self.words, stride: words }, factors: &self.factors }
     }
@@ -142,17 +156,23 @@ impl OperandBuffer {
 pub fn quantise_into(
     simd: Simd,
     width: usize,
-    (source, stride): (&[f32], usize),
+    source: (&[f32], usize),
     (out, out_stride): (&mut [u32], usize),
     factors: &mut [f32],
 ) {
-    assert_eq!(width % width_step(simd), 0, "rows must be whole vectors wide");
-    if factors.is_empty() {
-        return;
-    }
-    assert!(covers(source.len(), factors.len(), stride, width), "source too short");
-    assert!(covers(out.len(), factors.len(), out_stride, Format::Int8.words(width)), "result too short");
-    quantise_rows(simd, SourceRows { source: source.as_ptr(), stride, width }, (out, out_stride), factors);
+    let (rows, words) = (factors.len(), Format::Int8.words(width));
+    let source = SourceRows::new(simd, source, rows, width);
+    assert!(rows == 0 || covers(out.len(), rows, out_stride, words), "result too short");
+    quantise_rows(simd, source, Channels::default(), (out, out_stride), factors);
+}
+
+/// What becomes codes: `value * gain + shift`, by column; where both are empty, the value as it is.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Channels<'a> {
+    /// `[width]`.
+    pub gain: &'a [f32],
+    /// `[width]`.
+    pub shift: &'a [f32],
 }
 
 /// Checked rows of whole vectors, as many as what is made of them has room for.
@@ -164,6 +184,14 @@ struct SourceRows {
 }
 
 impl SourceRows {
+    /// # Panics
+    /// If `source` is too short, or `width` is not a multiple of [`width_step`].
+    fn new(simd: Simd, (source, stride): (&[f32], usize), rows: usize, width: usize) -> Self {
+        assert_eq!(width % width_step(simd), 0, "rows must be whole vectors wide");
+        assert!(rows == 0 || covers(source.len(), rows, stride, width), "source too short");
+        Self { source: source.as_ptr(), stride, width }
+    }
+
     /// Where one begins.
     #[inline(always)]
     unsafe fn row(&self, index: usize) -> *const f32 {
@@ -196,32 +224,73 @@ unsafe fn round<V: Lanes>(rows: SourceRows, packed: &mut [u32]) {
 }
 
 /// Codes of as many rows as there are factors, the largest magnitude of each becoming 127, and what one is worth.
-fn quantise_rows(simd: Simd, rows: SourceRows, (packed, stride): (&mut [u32], usize), factors: &mut [f32]) {
+fn quantise_rows(
+    simd: Simd,
+    rows: SourceRows,
+    channels: Channels<'_>,
+    (packed, stride): (&mut [u32], usize),
+    factors: &mut [f32],
+) {
+    let counts = (channels.gain.len(), channels.shift.len());
+    assert!(counts == (0, 0) || counts == (rows.width, rows.width), "every column needs its gain and shift");
     at_level!(
         simd,
-        (rows: SourceRows = rows, packed: &mut [u32] = packed, stride: usize = stride, factors: &mut [f32] = factors),
-        quantise::<Portable>(rows, packed, stride, factors),
-        quantise::<Avx2>(rows, packed, stride, factors),
-        quantise::<Avx512>(rows, packed, stride, factors),
+        (
+            rows: SourceRows = rows,
+            channels: Channels<'_> = channels,
+            packed: &mut [u32] = packed,
+            stride: usize = stride,
+            factors: &mut [f32] = factors
+        ),
+        quantise::<Portable>(rows, channels, packed, stride, factors),
+        quantise::<Avx2>(rows, channels, packed, stride, factors),
+        quantise::<Avx512>(rows, channels, packed, stride, factors),
     );
 }
 
 #[inline(always)]
-unsafe fn quantise<V: Lanes>(rows: SourceRows, packed: &mut [u32], stride: usize, factors: &mut [f32]) {
+unsafe fn quantise<V: Lanes>(
+    rows: SourceRows,
+    channels: Channels<'_>,
+    packed: &mut [u32],
+    stride: usize,
+    factors: &mut [f32],
+) {
+    let Channels { gain, shift } = channels;
+    // SAFETY: there is a gain and a shift for every column, or the first is chosen; the rest is the caller's.
+    unsafe {
+        if gain.is_empty() {
+            quantise_as::<V>(rows, |_, value| value, packed, stride, factors);
+        } else {
+            // Two roundings, as every level has them: the codes are the same everywhere.
+            let scaled = |at, value: V| value.mul(V::load(gain.as_ptr().add(at))).add(V::load(shift.as_ptr().add(at)));
+            quantise_as::<V>(rows, scaled, packed, stride, factors);
+        }
+    }
+}
+
+#[inline(always)]
+unsafe fn quantise_as<V: Lanes>(
+    rows: SourceRows,
+    scaled: impl Fn(usize, V) -> V,
+    packed: &mut [u32],
+    stride: usize,
+    factors: &mut [f32],
+) {
     for (index, factor) in factors.iter_mut().enumerate() {
         // SAFETY: rows are whole vectors and take a quarter as many words, for which there is room.
         unsafe {
             let packed = packed.as_mut_ptr().add(index * stride).cast::<u8>();
             let mut highest = V::splat(0.0);
             for at in (0..rows.width).step_by(V::COUNT) {
-                let value = V::load(rows.row(index).add(at));
+                let value = scaled(at, V::load(rows.row(index).add(at)));
                 highest = highest.max(value.max(V::splat(0.0).sub(value)));
             }
             let largest = highest.maximum().max(f32::MIN_POSITIVE * 256.0);
             let (scale, centre) = (V::splat(127.0 / largest), V::splat(128.0));
             for at in (0..rows.width).step_by(V::COUNT) {
-                // Two roundings, as every level has them: the codes are the same everywhere.
-                let code = V::load(rows.row(index).add(at)).mul(scale).add(centre);
+                // Two roundings here too.
+                let code = scaled(at, V::load(rows.row(index).add(at))).mul(scale).add(centre);
                 code.store_u8(packed.add(at));
             }
             *factor = largest / 127.0;
@@ -271,6 +340,30 @@ mod tests {
                 }
             }
         }
+    }
+
+    proptest! {
+        #[test]
+        fn codes_are_those_of_what_the_channels_make_of_a_value(rows in 1usize..4, steps in 1usize..5, seed in 0u32..99) {
+            let width = steps * 16;
+            let (source, gain, shift) = (ramp(rows * width, seed), ramp(width, seed + 1), ramp(width, seed + 2));
+            let scaled: Vec<f32> =
+                source.iter().enumerate().map(|(at, value)| value * gain[at % width] + shift[at % width]).collect();
+            for simd in Simd::all() {
+                let (mut ours, mut plain) = (OperandBuffer::default(), OperandBuffer::default());
+                let channels = Channels { gain: &gain, shift: &shift };
+                let ours = ours.pack_scaled(simd, Format::Int8, rows, width, (&source, width), channels);
+                let plain = plain.pack(simd, Format::Int8, rows, width, (&scaled, width));
+                prop_assert_eq!((ours.rows.data, ours.factors), (plain.rows.data, plain.factors));
+            }
+        }
+    }
+
+    #[test]
+    #[should_panic(expected = "every column needs its gain and shift")]
+    fn channels_that_are_too_few_are_refused() {
+        let channels = Channels { gain: &[1.0; 16], shift: &[0.0; 15] };
+        OperandBuffer::default().pack_scaled(Simd::SCALAR, Format::Int8, 1, 16, (&[1.0; 16], 16), channels);
     }
 
     #[test]

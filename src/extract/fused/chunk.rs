@@ -115,7 +115,7 @@ impl ChunkPlan {
         self.normalize(chunk, rows, scratch);
         let Scratch { block: sums, input, hidden, packed, packed_block, .. } = scratch;
         hidden.resize(self.shape.chunk_rows * head_dim);
-        let left = packed.pack(self.simd, block.qkv.weight.format(), rows, self.dim, (input, self.dim));
+        let left = self.normalized(&block.qkv, rows, input, packed);
         self.linear(rows, left, &block.qkv, sums, |panel, token, product| {
             let (simd, shape) = (self.simd, &self.shape);
             let (part, column) = (panel * columns / self.dim, panel * columns % self.dim);
@@ -178,7 +178,7 @@ impl ChunkPlan {
         let Scratch { block: sums, input, hidden, packed, packed_block, .. } = scratch;
         let (fc1, fc2, format) = (&block.fc1, &block.fc2, block.fc2.weight.format());
         let gelu = if format == Format::F32 { Epilogue::BiasGelu } else { Epilogue::BiasShortGelu };
-        let normalized = packed.pack(simd, fc1.weight.format(), rows, self.dim, (input, self.dim));
+        let normalized = self.normalized(fc1, rows, input, packed);
         for (slice, from) in (0..fc1.weight.n()).step_by(HIDDEN_SLICE).enumerate() {
             let to = fc1.weight.n().min(from + HIDDEN_SLICE);
             let (width, panels) = (to - from, from / columns..to.div_ceil(columns));
@@ -189,7 +189,7 @@ impl ChunkPlan {
                     let out = &mut hidden[first * HIDDEN_SLICE + panel * columns - from..];
                     finish_block(simd, gelu, product, out, HIDDEN_SLICE);
                 });
-                packed_block.pack(simd, format, rows, width, (hidden, HIDDEN_SLICE))
+                packed_block.pack_scaled(simd, format, rows, width, (hidden, HIDDEN_SLICE), fc2.channels(from..to))
             } else {
                 let words = format.words(width);
                 let finished = packed_block.rows(format, rows, width);
@@ -212,6 +212,18 @@ impl ChunkPlan {
         scratch.input.resize(self.shape.chunk_rows * self.dim);
         let len = rows * self.dim;
         normalize_rows(self.simd, self.dim, LAYER_NORM_EPS, &chunk.tokens[..len], &mut scratch.input[..len]);
+    }
+
+    /// Normalised tokens as `layer` multiplies them.
+    fn normalized<'a>(
+        &self,
+        layer: &PackedLinear,
+        rows: usize,
+        input: &'a [f32],
+        packed: &'a mut OperandBuffer,
+    ) -> Left<'a> {
+        let (format, channels) = (layer.weight.format(), layer.channels(0..self.dim));
+        packed.pack_scaled(self.simd, format, rows, self.dim, (input, self.dim), channels)
     }
 
     /// All panels of a layer: `finish(panel, first row, product)` sees each block of rows while it is hot.

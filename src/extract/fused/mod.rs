@@ -6,14 +6,16 @@
 //! (bias, GELU, residual) while it is in the first-level cache. So a block of the transformer is one parallel loop over
 //! the chunks of all images, and scores and hidden activations never reach memory.
 //!
-//! Products are in f32, or layers in bf16 or int8, and then the scores of attention in int8 (bf16 in matrix registers) and
-//! its mix of values in bf16 (f32 where the CPU lacks it); everything between them is f32.
+//! Products are in f32, or layers in bf16 or int8, which may differ from block to block, and then the scores of attention
+//! in int8 (bf16 in matrix registers) and its mix of values in bf16 (f32 where the CPU lacks it); everything between them
+//! is f32.
 //!
 //! No sum depends on how chunks are spread over threads or on other images, so a batch gives bit for bit what single
 //! images give. Buffers are kept between calls; in the steady state only the answer is allocated.
 
 mod chunk;
 mod operation;
+mod spread;
 #[cfg(test)]
 mod tests;
 mod weights;
@@ -32,6 +34,7 @@ use crate::kernels::{Simd, SimdLevel};
 use crate::types::{ImageTensor, InvalidValue};
 use chunk::{Chunk, ChunkPlan, HIDDEN_SLICE, Scratch};
 use rayon::prelude::*;
+use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
 use weights::{PackedBlock, PackedLinear};
 
@@ -92,7 +95,7 @@ impl FusedEncoder {
         simd: Simd,
         precision: Precision,
     ) -> Result<Self, ExtractError> {
-        let chosen = choose_formats(simd, precision)?;
+        let chosen = choose_formats(simd, precision, spec.blocks())?;
         Self::with_formats(weights, spec, simd, chosen)
     }
 
@@ -139,8 +142,13 @@ impl FusedEncoder {
             head_dim: geometry.head_dim(),
             chunk_rows: chunk_rows(simd, 1 + grid.len(), 1, 1),
         };
-        let pack =
-            |block| PackedBlock::pack((simd, formats.layers), block, geometry.dim, geometry.head_dim(), HIDDEN_SLICE);
+        let dims = (geometry.dim, geometry.head_dim());
+        let spreads = spread::measure(weights, formats.int8_blocks.end)?;
+        let pack = |(index, block)| {
+            let spread = formats.int8_blocks.contains(&index).then(|| &spreads[index]);
+            let format = if spread.is_some() { Format::Int8 } else { formats.others };
+            PackedBlock::pack((simd, format), block, dims, HIDDEN_SLICE, spread)
+        };
         Ok(Self {
             spec,
             precision,
@@ -149,7 +157,7 @@ impl FusedEncoder {
             plan: ChunkPlan { simd, shape, dim: geometry.dim, patch_len: 3 * patch * patch },
             embedding: PackedLinear::plain(simd, &weights.patch_embed),
             positions,
-            blocks: weights.blocks[..spec.blocks()].iter().map(pack).collect(),
+            blocks: weights.blocks[..spec.blocks()].par_iter().enumerate().map(pack).collect(),
             norm: weights.norm.clone(),
             workspaces: Pool(Mutex::default()),
             scratches: Pool(Mutex::default()),
@@ -303,15 +311,18 @@ impl FusedEncoder {
 }
 
 /// Formats of all products.
-#[derive(Clone, Copy)]
+#[derive(Clone)]
 struct Formats {
-    layers: Format,
+    /// Blocks whose layers are int8.
+    int8_blocks: Range<usize>,
+    /// The layers of the others.
+    others: Format,
     scores: Format,
     mix: Format,
 }
 
-/// What `precision` comes to at this level; `Auto` is settled.
-fn choose_formats(simd: Simd, precision: Precision) -> Result<(Precision, Formats), ExtractError> {
+/// What `precision` comes to at this level in so many blocks; `Auto` is settled.
+fn choose_formats(simd: Simd, precision: Precision, blocks: usize) -> Result<(Precision, Formats), ExtractError> {
     let lacks = |what: &str| {
         let reason = format!("it needs a CPU with {what}, used at level avx512; this is level {}", simd.level());
         Err(ExtractError::Precision { precision: precision.name(), reason })
@@ -321,14 +332,27 @@ fn choose_formats(simd: Simd, precision: Precision) -> Result<(Precision, Format
     // A head's codes lose no more of a score than bf16 does. Where matrix registers multiply bf16, finishing sums of
     // integers would take as long as it saves.
     let scores = if int8 && simd.level() < SimdLevel::Amx { Format::Int8 } else { mix };
+    let chosen = |int8_blocks, others| Ok((precision, Formats { int8_blocks, others, scores, mix }));
     match precision {
-        Precision::Auto => choose_formats(simd, if simd.has_bf16_dot() { Precision::Bf16 } else { Precision::F32 }),
-        Precision::F32 => Ok((precision, Formats { layers: Format::F32, scores: Format::F32, mix: Format::F32 })),
-        Precision::Bf16 if bf16 => Ok((precision, Formats { layers: Format::Bf16, scores, mix })),
+        // At level scalar codes are possible, but slower than floats.
+        Precision::Auto if simd.level() >= SimdLevel::Avx512 => choose_formats(simd, Precision::Mixed, blocks),
+        Precision::Auto => choose_formats(simd, Precision::F32, blocks),
+        Precision::F32 => {
+            let (others, scores, mix) = (Format::F32, Format::F32, Format::F32);
+            Ok((precision, Formats { int8_blocks: 0..0, others, scores, mix }))
+        }
+        Precision::Bf16 if bf16 => chosen(0..0, Format::Bf16),
         Precision::Bf16 => lacks("AVX-512 BF16"),
-        Precision::Int8 if int8 => Ok((precision, Formats { layers: Format::Int8, scores, mix })),
-        Precision::Int8 => lacks("AVX-512 VNNI"),
+        Precision::Mixed if int8 => chosen(mixed_int8_blocks(blocks), mix),
+        Precision::Int8 if int8 => chosen(0..blocks, mix),
+        Precision::Mixed | Precision::Int8 => lacks("AVX-512 VNNI"),
     }
+}
+
+/// Of so many blocks, those that [`Precision::Mixed`] computes in int8: from the second to the middle. There an error
+/// costs least: the first block's inputs stray most, and what the later ones lose no block evens out.
+pub fn mixed_int8_blocks(blocks: usize) -> Range<usize> {
+    1..blocks.div_ceil(2).max(1)
 }
 
 impl Encoder for FusedEncoder {

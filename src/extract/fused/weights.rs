@@ -7,10 +7,12 @@
 //! are that much smaller, and what bf16 loses of a score is no more than what it loses elsewhere. Sums are taken in f64
 //! once; what is left at run time is products, biases, and nothing else.
 
+use super::spread::{BlockSpread, Spread};
 use crate::extract::weights::{BlockWeights, Linear, Norm};
 use crate::kernels::Simd;
 use crate::kernels::gemm::{PackedMatrix, Tiling};
-use crate::kernels::operand::Format;
+use crate::kernels::operand::{Channels, Format};
+use std::ops::Range;
 
 /// A linear layer, packed.
 pub(super) struct PackedLinear {
@@ -18,6 +20,9 @@ pub(super) struct PackedLinear {
     pub weight: PackedMatrix,
     /// b, zero beyond the last output up to a whole panel.
     pub bias: Vec<f32>,
+    /// How inputs are scaled before they become codes, `[in]` or empty.
+    gain: Vec<f32>,
+    shift: Vec<f32>,
 }
 
 impl PackedLinear {
@@ -43,7 +48,35 @@ impl PackedLinear {
         };
         let padded = outputs.next_multiple_of(Tiling::of(simd).columns);
         let bias = (0..padded).map(|o| if o < outputs { shifted(o) } else { 0.0 }).collect();
-        Self { weight, bias }
+        Self { weight, bias, gain: Vec::new(), shift: Vec::new() }
+    }
+
+    /// Packs a layer that multiplies what `spread` makes of its inputs. They come without the scale and shift of
+    /// `norm`, the LayerNorm before it if there is one; these go to the inputs that become codes, or else into W and b.
+    fn pack_spread(
+        kernels: (Simd, Format),
+        layer: &Linear,
+        slice: usize,
+        rows: impl Fn(usize) -> f32,
+        (norm, spread): (Option<&Norm>, Option<&Spread>),
+    ) -> Self {
+        let Some(spread) = spread else { return Self::pack(kernels, layer, slice, rows, norm) };
+        let inputs = 0..spread.centre.len();
+        let gain = |i: usize| norm.map_or(1.0, |norm| norm.weight[i]) / spread.scale[i];
+        let shift = |i: usize| (norm.map_or(0.0, |norm| norm.bias[i]) - spread.centre[i]) / spread.scale[i];
+        Self {
+            gain: inputs.clone().map(gain).collect(),
+            shift: inputs.map(shift).collect(),
+            ..Self::pack(kernels, layer, slice, rows, Some(&spread.undone()))
+        }
+    }
+
+    /// How the inputs in `range` are scaled before they become codes.
+    pub fn channels(&self, range: Range<usize>) -> Channels<'_> {
+        if self.gain.is_empty() {
+            return Channels::default();
+        }
+        Channels { gain: &self.gain[range.clone()], shift: &self.shift[range] }
     }
 
     /// Packs a layer as it is, in f32.
@@ -58,7 +91,8 @@ impl PackedLinear {
     }
 
     pub fn bytes(&self) -> usize {
-        self.weight.bytes() + size_of_val(self.bias.as_slice())
+        self.weight.bytes()
+            + [&self.bias, &self.gain, &self.shift].map(|values| size_of_val(values.as_slice())).iter().sum::<usize>()
     }
 }
 
@@ -71,25 +105,42 @@ pub(super) struct PackedBlock {
 }
 
 impl PackedBlock {
-    /// Packs a block whose hidden layer is computed `hidden_slice` numbers at a time.
+    /// Packs a block whose hidden layer is computed `hidden_slice` numbers at a time, and whose inputs are scaled by
+    /// `spread` if they become codes.
     pub fn pack(
         kernels: (Simd, Format),
         block: &BlockWeights,
-        dim: usize,
-        head_dim: usize,
+        (dim, head_dim): (usize, usize),
         hidden_slice: usize,
+        spread: Option<&BlockSpread>,
     ) -> Self {
         let query_scale = std::f32::consts::LOG2_E / (head_dim as f32).sqrt();
         let scale = |layer_scale: &Option<Vec<f32>>, o: usize| layer_scale.as_ref().map_or(1.0, |scale| scale[o]);
-        let query = |o: usize| if o < dim { query_scale } else { 1.0 };
+        // Softmax's weights add up to one, so that what is done to all values is done to every mix of them: the
+        // projection's inputs come scaled.
+        let mixed = spread.map(|spread| &spread.proj);
+        let query_or_value = |o: usize| match o {
+            _ if o < dim => query_scale,
+            _ if o < 2 * dim => 1.0,
+            _ => mixed.map_or(1.0, |mixed| 1.0 / mixed.scale[o - 2 * dim]),
+        };
         let whole = usize::MAX;
-        let mut qkv = PackedLinear::pack(kernels, &block.qkv, whole, query, Some(&block.norm1));
+        let norm1 = (Some(&block.norm1), spread.map(|spread| &spread.qkv));
+        let mut qkv = PackedLinear::pack_spread(kernels, &block.qkv, whole, query_or_value, norm1);
         qkv.bias[dim..2 * dim].fill(0.0);
+        if let Some(Spread { centre, scale }) = mixed {
+            let values = qkv.bias[2 * dim..3 * dim].iter_mut();
+            values.zip(centre.iter().zip(scale)).for_each(|(bias, (centre, scale))| *bias -= centre / scale);
+        }
+        let undone = mixed.map(Spread::undone);
+        let norm2 = (Some(&block.norm2), spread.map(|spread| &spread.fc1));
+        let hidden = (None, spread.map(|spread| &spread.fc2));
+        let (scale1, scale2) = (|o| scale(&block.layer_scale1, o), |o| scale(&block.layer_scale2, o));
         Self {
             qkv,
-            proj: PackedLinear::pack(kernels, &block.proj, whole, |o| scale(&block.layer_scale1, o), None),
-            fc1: PackedLinear::pack(kernels, &block.fc1, whole, |_| 1.0, Some(&block.norm2)),
-            fc2: PackedLinear::pack(kernels, &block.fc2, hidden_slice, |o| scale(&block.layer_scale2, o), None),
+            proj: PackedLinear::pack(kernels, &block.proj, whole, scale1, undone.as_ref()),
+            fc1: PackedLinear::pack_spread(kernels, &block.fc1, whole, |_| 1.0, norm2),
+            fc2: PackedLinear::pack_spread(kernels, &block.fc2, hidden_slice, scale2, hidden),
         }
     }
 
