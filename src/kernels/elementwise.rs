@@ -128,16 +128,13 @@ impl FinishJob<'_, f32> {
         // SAFETY: `finish_block` has checked the extents.
         unsafe {
             let place = |row: usize, column: usize| self.out.add(row * self.out_stride + column);
-            match epilogue {
-                Epilogue::Bias => self.each::<V>(|value, row, column| value.store(place(row, column))),
-                Epilogue::BiasGelu => self.each::<V>(|value, row, column| gelu(value, &GELU).store(place(row, column))),
-                Epilogue::BiasShortGelu => {
-                    self.each::<V>(|value, row, column| gelu(value, &GELU_SHORT).store(place(row, column)));
-                }
-                Epilogue::BiasResidual => self.each::<V>(|value, row, column| {
+            if epilogue == Epilogue::BiasResidual {
+                self.each::<V>(|value, row, column| {
                     let place = place(row, column);
                     value.add(V::load(place)).store(place);
-                }),
+                });
+            } else {
+                self.activated::<V>(epilogue, |value, row, column| value.store(place(row, column)));
             }
         }
     }
@@ -149,22 +146,27 @@ impl FinishJob<'_, u32> {
         // SAFETY: `finish_words` has checked the extents.
         unsafe {
             let place = |row: usize, column: usize| self.out.add(row * self.out_stride + column / 2);
-            match epilogue {
-                Epilogue::BiasGelu => {
-                    self.each::<V>(|value, row, column| gelu(value, &GELU).store_bf16(place(row, column)));
-                }
-                Epilogue::BiasShortGelu => {
-                    self.each::<V>(|value, row, column| gelu(value, &GELU_SHORT).store_bf16(place(row, column)));
-                }
-                Epilogue::Bias | Epilogue::BiasResidual => {
-                    self.each::<V>(|value, row, column| value.store_bf16(place(row, column)));
-                }
-            }
+            self.activated::<V>(epilogue, |value, row, column| value.store_bf16(place(row, column)));
         }
     }
 }
 
 impl<T> FinishJob<'_, T> {
+    /// Every vector of the product with its bias and through its activation, its row and its column.
+    #[inline(always)]
+    unsafe fn activated<V: Lanes>(&self, epilogue: Epilogue, finish: impl Fn(V, usize, usize)) {
+        // SAFETY: the caller's.
+        unsafe {
+            match epilogue {
+                Epilogue::BiasGelu => self.each::<V>(|value, row, column| finish(gelu(value, &GELU), row, column)),
+                Epilogue::BiasShortGelu => {
+                    self.each::<V>(|value, row, column| finish(gelu(value, &GELU_SHORT), row, column));
+                }
+                Epilogue::Bias | Epilogue::BiasResidual => self.each::<V>(finish),
+            }
+        }
+    }
+
     /// Every vector of the product with its bias, its row and its column.
     #[inline(always)]
     unsafe fn each<V: Lanes>(&self, finish: impl Fn(V, usize, usize)) {
