@@ -4,8 +4,9 @@
 //! A LayerNorm's scale and shift go into the layer that reads it (W diag(g), b + W s), LayerScale into the layer it
 //! scales (diag(l) W, l b), and the factor log2(e) / sqrt(head_dim) into the query rows, so that scores are exponents of
 //! two. The bias of the keys adds the same to all scores of a query, which softmax takes out again: it is left out. Keys
-//! are that much smaller, and what bf16 loses of a score is no more than what it loses elsewhere. Sums are taken in f64
-//! once; what is left at run time is products, biases, and nothing else.
+//! are that much smaller, and what bf16 loses of a score is no more than what it loses elsewhere. Inputs that become int8
+//! codes are centred and scaled by channel first ([`super::spread`]); W and b make that good. Sums are taken in f64 once;
+//! what is left at run time is products, biases, and nothing else.
 
 use super::spread::{BlockSpread, Spread};
 use crate::extract::weights::{BlockWeights, Linear, Norm};
