@@ -4,18 +4,17 @@
     PLACEFORMER_BENCH_JPEG=FILE cargo bench --bench decode
     python benches/peers/decode_opencv.py FILE [--size 448x336] [--threads 2]
 
-Both measure the same file; ours is antialiased. Prints one JSON object: milliseconds, median and least, for pixels
-(decoded and resized) and for the tensor (also normalised, a plane for each colour).
+Both measure the same file; ours is antialiased. Prints one JSON object: milliseconds, median and least, and the CPU
+time of all threads, for pixels (decoded and resized) and for the tensor (also normalised, a plane for each colour).
 """
 
 import argparse
 import json
-import statistics
-import time
 from pathlib import Path
 
 import cv2
 import numpy as np
+from timing import measure
 
 MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
@@ -30,16 +29,6 @@ def tensor(photo, size, interpolation):
     return np.ascontiguousarray(image.transpose(2, 0, 1))
 
 
-def measure(run, repetitions):
-    run()
-    times = []
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        run()
-        times.append((time.perf_counter() - start) * 1e3)
-    return {"median_ms": round(statistics.median(times), 2), "least_ms": round(min(times), 2)}
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photo", type=Path)
@@ -51,7 +40,9 @@ def main():
     size = tuple(map(int, arguments.size.split("x")))
     photo = np.frombuffer(arguments.photo.read_bytes(), np.uint8)
     results = {
-        f"{name}-{step.__name__}": measure(lambda: step(photo, size, interpolation), arguments.repetitions)
+        f"{name}-{step.__name__}": measure(
+            lambda photos: step(photos[0], size, interpolation), [photo], arguments.repetitions
+        )
         for name, interpolation in (("linear", cv2.INTER_LINEAR), ("area", cv2.INTER_AREA))
         for step in (pixels, tensor)
     }

@@ -21,11 +21,10 @@ from pathlib import Path
 import cv2
 import faiss
 import numpy as np
+from decode_opencv import tensor
 from extract_openvino import HEADS, PATCH, build, fused_names, openvino_runner
 from safetensors.numpy import load_file
 
-MEAN = np.array([0.485, 0.456, 0.406], np.float32)
-DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
 CAPS, COMBINATIONS, CANDIDATES = (400, 200, 50), ((0,), (0, 1), (1, 2)), 100
 TOLERANCE, ITERATIONS, CONFIDENCE = 1.5 * PATCH, 2000, 0.995
 
@@ -53,10 +52,8 @@ class Pipeline:
         self.index, self.drawn = None, 0
 
     def decode(self, photo):
-        image = cv2.imdecode(np.frombuffer(photo, np.uint8), cv2.IMREAD_COLOR)
-        image = cv2.resize(image, (self.columns * PATCH, self.rows * PATCH), interpolation=cv2.INTER_LINEAR)
-        image = (cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float32) / 255 - MEAN) / DEVIATION
-        return np.ascontiguousarray(image.transpose(2, 0, 1)[None])
+        size = (self.columns * PATCH, self.rows * PATCH)
+        return tensor(np.frombuffer(photo, np.uint8), size, cv2.INTER_LINEAR)[None]
 
     def extract(self, pixels):
         tokens, attention = self.infer(pixels)

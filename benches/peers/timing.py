@@ -1,4 +1,4 @@
-"""How long a run takes, for the peers that stand beside the extraction."""
+"""How long a run takes, for the peers that stand beside extraction and decoding."""
 
 import statistics
 import time
