@@ -85,7 +85,7 @@ pub trait Encoder: Send + Sync {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// The fastest that recognises as well as f32: mixed where the CPU multiplies int8 vectors, else f32.
+    /// The fastest whose answers, re-ranked, are as good as those of f32: mixed where the CPU multiplies int8 vectors, else f32.
     #[default]
     Auto,
     /// 32-bit floats.
@@ -125,7 +125,7 @@ impl FromStr for Precision {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         Self::ALL.into_iter().find(|precision| precision.name().eq_ignore_ascii_case(text)).ok_or_else(|| {
-            InvalidValue::new("precision", format!("{text:?} is not one of auto, f32, bf16, mixed, int8"))
+            InvalidValue::new("precision", format!("{text:?} is not one of {}", Self::ALL.map(Self::name).join(", ")))
         })
     }
 }

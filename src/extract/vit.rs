@@ -67,8 +67,8 @@ pub(super) enum BlockLayer {
     Fc2,
 }
 
-/// What a layer of a block is given, by number of the block.
-type Record<'a> = &'a mut dyn FnMut(usize, BlockLayer, &Tensor) -> Result<()>;
+/// Sees what the layers are given, one block after the other.
+type Record<'a> = &'a mut dyn FnMut(BlockLayer, &Tensor) -> Result<()>;
 
 /// What one pass leaves behind.
 struct Pass {
@@ -98,18 +98,19 @@ impl CandleEncoder {
         })
     }
 
-    /// Runs the transformer for what goes into its linear layers: `record(block, layer, inputs)`, `[1 + n, width]`.
+    /// Runs the transformer for what goes into its linear layers: `record(layer, inputs)`, `[1 + n, width]`, one
+    /// block after the other.
     ///
     /// # Errors
     /// The image's size, or candle's.
     pub(super) fn record_inputs(
         &self,
         image: &ImageTensor,
-        record: &mut dyn FnMut(usize, BlockLayer, &[f32]),
+        record: &mut dyn FnMut(BlockLayer, &[f32]),
     ) -> std::result::Result<(), ExtractError> {
         check_image(image, &self.spec)?;
-        self.run(image, &mut |block, layer, inputs| {
-            record(block, layer, &inputs.flatten_all()?.to_vec1::<f32>()?);
+        self.run(image, &mut |layer, inputs| {
+            record(layer, &inputs.flatten_all()?.to_vec1::<f32>()?);
             Ok(())
         })?;
         Ok(())
@@ -126,7 +127,7 @@ impl CandleEncoder {
                 cls_attention = Some(block.cls_attention(&x, &self.geometry)?);
                 break;
             }
-            let (next, attention) = block.forward(&x, &self.geometry, &mut |layer, inputs| record(i, layer, inputs))?;
+            let (next, attention) = block.forward(&x, &self.geometry, record)?;
             x = next;
             if i == self.spec.attention_block {
                 cls_attention = Some(attention);
@@ -177,7 +178,7 @@ impl Encoder for CandleEncoder {
         images
             .iter()
             .map(|image| {
-                let pass = self.run(image, &mut |_, _, _| Ok(()))?;
+                let pass = self.run(image, &mut |_, _| Ok(()))?;
                 let mut tokens = pass.tokens.flatten_all()?.to_vec1::<f32>()?;
                 let cls_token = tokens.drain(..self.geometry.dim).collect();
                 Ok(EncodedImage {
@@ -210,12 +211,7 @@ impl Block {
     }
 
     /// The block's output `[1 + n, d]` and its CLS attention `[heads, n]`; `record` sees what its layers are given.
-    fn forward(
-        &self,
-        x: &Tensor,
-        geometry: &Geometry,
-        record: &mut dyn FnMut(BlockLayer, &Tensor) -> Result<()>,
-    ) -> Result<(Tensor, Tensor)> {
+    fn forward(&self, x: &Tensor, geometry: &Geometry, record: Record<'_>) -> Result<(Tensor, Tensor)> {
         let (length, dim) = x.dims2()?;
         let normed = self.norm1.forward(x)?;
         record(BlockLayer::Qkv, &normed)?;

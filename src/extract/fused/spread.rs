@@ -52,7 +52,7 @@ pub(super) fn measure(weights: &VitWeights, blocks: usize) -> Result<Vec<BlockSp
     let last = blocks - 1;
     let spec = EncoderSpec { input_size: size, exit_block: last, token_norm: false, attention_block: last };
     let mut found: [Vec<Spread>; 4] = Default::default();
-    CandleEncoder::new(weights, &spec)?.record_inputs(&street(size), &mut |_, layer, inputs| {
+    CandleEncoder::new(weights, &spec)?.record_inputs(&street(size), &mut |layer, inputs| {
         let width = if layer == BlockLayer::Fc2 { weights.geometry.mlp_dim } else { weights.geometry.dim };
         found[layer as usize].push(Spread::of(inputs, width, evened_out(layer)));
     })?;

@@ -112,9 +112,9 @@ fn equals_candle_at_every_level_size_and_exit() {
             let attention = largest_difference(&actual.cls_attention, &expected.cls_attention);
             // Random weights spread an error over all tokens; what trained ones lose is measured with the real model.
             let (least, of_tokens, of_attention) = match precision {
-                Precision::Bf16 => (0.999, 0.3, 0.015),
+                Precision::Bf16 => (0.999, 0.3, 0.01),
                 Precision::Mixed | Precision::Int8 => (0.995, 0.4, 0.02),
-                _ => (0.999_999, 1e-4, 1e-5),
+                _ => (0.999_999, 1e-4, 5e-6),
             };
             assert!(tokens < of_tokens, "{} at {size}, exit {exit}: tokens off by {tokens}", fused.name());
             assert!(attention < of_attention, "{} at {size}, exit {exit}: attention off by {attention}", fused.name());

@@ -1,7 +1,8 @@
 //! AVX-512 VNNI: tiles of 12 rows by 32 columns, products by `vpdpbusd`.
 //!
 //! The instruction multiplies unsigned by signed bytes, so columns are offset by 128, once for all candidates, and sums
-//! start at -128 times that of a row's codes. Written on a CPU without it: [`super::check`] must pass before this level is used.
+//! start at -128 times that of a row's codes. Written on a CPU without it: [`super::check`] must pass before this level
+//! is used.
 
 use super::driver::{self, Level};
 use super::{BlockMaxima, Blocks, Line, PackedColumns, Quantised, SECTIONS, Scratch};
