@@ -1,7 +1,8 @@
 //! From a 1080p JPEG to the model's tensor: ours beside the image crate alone.
 //!
-//! The picture is a rendered street, so that its entropy is that of a photo and nothing needs to be shipped. Set
-//! `PLACEFORMER_BENCH_JPEG` to measure another file, for instance beside another library on the same file.
+//! The picture is a rendered street, so that its entropy is that of a photo and nothing needs to be
+//! shipped. Set `PLACEFORMER_BENCH_JPEG` to measure another file, for instance beside another
+//! library on the same file.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use placeformer::bench::{baselines, scenes::photo};
@@ -9,7 +10,10 @@ use placeformer::image::{ImageConfig, load_tensor};
 use placeformer::types::ImageSize;
 use std::hint::black_box;
 
-const TARGET: ImageSize = ImageSize { width: 448, height: 336 };
+const TARGET: ImageSize = ImageSize {
+    width: 448,
+    height: 336,
+};
 
 fn jpeg() -> Vec<u8> {
     match std::env::var_os("PLACEFORMER_BENCH_JPEG") {
@@ -22,8 +26,12 @@ fn decode(criterion: &mut Criterion) {
     let bytes = jpeg();
     let mut group = criterion.benchmark_group("decode_resize_1080p");
     group.sample_size(30);
-    group.bench_function("ours", |b| b.iter(|| load_tensor(black_box(&bytes), &ImageConfig::default(), TARGET)));
-    group.bench_function("image_crate", |b| b.iter(|| baselines::load_tensor(black_box(&bytes), TARGET)));
+    group.bench_function("ours", |b| {
+        b.iter(|| load_tensor(black_box(&bytes), &ImageConfig::default(), TARGET))
+    });
+    group.bench_function("image_crate", |b| {
+        b.iter(|| baselines::load_tensor(black_box(&bytes), TARGET))
+    });
     group.finish();
 }
 

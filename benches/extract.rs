@@ -1,11 +1,10 @@
-//! Extraction of one image at the default preset: the fused encoder at every level and precision of this CPU,
-//! beside the candle one.
-//! Weights are random, which costs the same as learned ones.
+//! Extraction of one image at the default preset: the fused encoder at every level and precision of
+//! this CPU, beside the candle one. Weights are random, which costs the same as learned ones.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use placeformer::extract::{
-    BlockWeights, CandleEncoder, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm, Precision, Preset,
-    VitWeights,
+    BlockWeights, CandleEncoder, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm,
+    Precision, Preset, VitWeights,
 };
 use placeformer::kernels::Simd;
 use placeformer::types::ImageTensor;
@@ -13,19 +12,27 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 fn values(random: &mut ChaCha8Rng, len: usize, spread: f32) -> Vec<f32> {
-    (0..len).map(|_| spread * random.random_range(-1.0f32..1.0)).collect()
+    (0..len)
+        .map(|_| spread * random.random_range(-1.0f32..1.0))
+        .collect()
 }
 
 fn linear(random: &mut ChaCha8Rng, outputs: usize, inputs: usize) -> Linear {
     let spread = (inputs as f32).sqrt().recip();
-    Linear { weight: values(random, outputs * inputs, spread), bias: values(random, outputs, 0.1) }
+    Linear {
+        weight: values(random, outputs * inputs, spread),
+        bias: values(random, outputs, 0.1),
+    }
 }
 
 fn weights(preset: Preset) -> VitWeights {
     let geometry = preset.geometry();
     let Geometry { dim, mlp_dim, .. } = geometry;
     let mut random = ChaCha8Rng::seed_from_u64(1);
-    let norm = || Norm { weight: vec![1.0; dim], bias: vec![0.0; dim] };
+    let norm = || Norm {
+        weight: vec![1.0; dim],
+        bias: vec![0.0; dim],
+    };
     let block = |random: &mut ChaCha8Rng| BlockWeights {
         norm1: norm(),
         qkv: linear(random, 3 * dim, dim),
@@ -52,8 +59,17 @@ fn weights(preset: Preset) -> VitWeights {
 fn extract(criterion: &mut Criterion) {
     let preset = Preset::Dinov2Vits14;
     let (weights, size, exit_block) = (weights(preset), preset.input_size(), preset.exit_block());
-    let spec = EncoderSpec { input_size: size, exit_block, token_norm: false, attention_block: exit_block };
-    let pixels = values(&mut ChaCha8Rng::seed_from_u64(2), 3 * (size.width * size.height) as usize, 2.0);
+    let spec = EncoderSpec {
+        input_size: size,
+        exit_block,
+        token_norm: false,
+        attention_block: exit_block,
+    };
+    let pixels = values(
+        &mut ChaCha8Rng::seed_from_u64(2),
+        3 * (size.width * size.height) as usize,
+        2.0,
+    );
     let image = ImageTensor { size, data: pixels };
     let mut group = criterion.benchmark_group("extract");
     group.sample_size(10);
@@ -63,19 +79,30 @@ fn extract(criterion: &mut Criterion) {
         let precisions = if simd == Simd::SCALAR {
             &[Precision::F32][..]
         } else {
-            &[Precision::F32, Precision::Bf16, Precision::Mixed, Precision::Int8][..]
+            &[
+                Precision::F32,
+                Precision::Bf16,
+                Precision::Mixed,
+                Precision::Int8,
+            ][..]
         };
         for encoder in precisions.iter().copied().filter_map(of_level) {
             encoders.push(Box::new(encoder));
         }
     }
-    encoders.push(Box::new(CandleEncoder::new(&weights, &spec).expect("the default spec suits the weights")));
+    encoders.push(Box::new(
+        CandleEncoder::new(&weights, &spec).expect("the default spec suits the weights"),
+    ));
     for encoder in &encoders {
-        group.bench_function(encoder.name(), |bencher| bencher.iter(|| encoder.encode(std::slice::from_ref(&image))));
+        group.bench_function(encoder.name(), |bencher| {
+            bencher.iter(|| encoder.encode(std::slice::from_ref(&image)))
+        });
     }
     let batch = vec![image; 8];
     let fused = &encoders[encoders.len() - 2];
-    group.bench_function(format!("{}-batch8", fused.name()), |bencher| bencher.iter(|| fused.encode(&batch)));
+    group.bench_function(format!("{}-batch8", fused.name()), |bencher| {
+        bencher.iter(|| fused.encode(&batch))
+    });
     group.finish();
 }
 

@@ -1,11 +1,12 @@
 //! Settings: defaults < file < environment < flags, checked once.
 //!
-//! [`Config`] is every room's own settings under one roof. [`Config::load`] reads them from all sources, refuses
-//! what it does not know by name, and checks the rest; [`Config::to_annotated_toml`] prints what is in force with a
-//! comment on every key, so that the printed file is the manual.
+//! [`Config`] is every room's own settings under one roof. [`Config::load`] reads them from all
+//! sources, refuses what it does not know by name, and checks the rest;
+//! [`Config::to_annotated_toml`] prints what is in force with a comment on every key, so that the
+//! printed file is the manual.
 //!
-//! An environment variable names its key with `__` between the levels: `PLACEFORMER_HTTP__LISTEN=0.0.0.0:80` is
-//! `listen` of `[http]`.
+//! An environment variable names its key with `__` between the levels:
+//! `PLACEFORMER_HTTP__LISTEN=0.0.0.0:80` is `listen` of `[http]`.
 
 use crate::extract::{ExtractConfig, HeadChoice, Precision, Preset};
 use crate::http::{AuthConfig, HttpConfig};
@@ -63,7 +64,9 @@ pub struct DataLocation {
 
 impl Default for DataLocation {
     fn default() -> Self {
-        Self { directory: PathBuf::from("placeformer-data") }
+        Self {
+            directory: PathBuf::from("placeformer-data"),
+        }
     }
 }
 
@@ -94,14 +97,15 @@ pub struct ModelOverrides {
     /// Backbone: dinov2-vits14, dinov2-vitb14, dinov2-vitl14 or placeformer-vits16.
     #[arg(long, value_name = "NAME")]
     pub preset: Option<Preset>,
-    /// Weights file for the backbone, such as `train` writes; its published ones are pulled on first use otherwise.
+    /// Weights file for the backbone, such as `train` writes; its published ones are pulled on
+    /// first use otherwise.
     #[arg(long, env = "PLACEFORMER_WEIGHTS", value_name = "FILE")]
     pub weights: Option<PathBuf>,
     /// Projection to the global descriptor: default, or a file.
     #[arg(long, value_name = "HEAD")]
     pub head: Option<HeadChoice>,
-    /// Arithmetic of the transformer: f32, bf16, int8, mixed (int8 in the blocks where it shows least, bf16 in the
-    /// others), or auto (mixed where the CPU has AVX-512 VNNI, else f32).
+    /// Arithmetic of the transformer: f32, bf16, int8, mixed (int8 in the blocks where it shows
+    /// least, bf16 in the others), or auto (mixed where the CPU has AVX-512 VNNI, else f32).
     #[arg(long, value_name = "NAME")]
     pub precision: Option<Precision>,
 }
@@ -121,7 +125,9 @@ pub enum ConfigError {
     #[error("the configuration is not valid: {0}")]
     Invalid(#[from] Box<figment::Error>),
     /// A variable looks like a setting but its levels are joined by one underscore.
-    #[error("{name} is not a setting: write the section and the key with two underscores between, such as {hint}")]
+    #[error(
+        "{name} is not a setting: write the section and the key with two underscores between, such as {hint}"
+    )]
     Variable {
         /// The variable.
         name: String,
@@ -153,8 +159,10 @@ impl Config {
     pub fn load(file: Option<&Path>, overrides: &Overrides) -> Result<Self, ConfigError> {
         let mut sources = Figment::from(Serialized::defaults(Self::default()));
         if let Some(path) = file {
-            let text = std::fs::read_to_string(path)
-                .map_err(|source| ConfigError::Unreadable { path: path.to_owned(), source })?;
+            let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Unreadable {
+                path: path.to_owned(),
+                source,
+            })?;
             sources = sources.merge(Toml::string(&text));
         }
         check_variables(std::env::vars_os().filter_map(|(name, _)| name.into_string().ok()))?;
@@ -166,12 +174,23 @@ impl Config {
     }
 
     fn apply(&mut self, overrides: &Overrides) {
-        let Overrides { listen, data, log_format, log, model } = overrides.clone();
+        let Overrides {
+            listen,
+            data,
+            log_format,
+            log,
+            model,
+        } = overrides.clone();
         self.http.listen = listen.unwrap_or_else(|| std::mem::take(&mut self.http.listen));
         self.data.directory = data.unwrap_or_else(|| std::mem::take(&mut self.data.directory));
         self.log.format = log_format.unwrap_or(self.log.format);
         self.log.filter = log.unwrap_or_else(|| std::mem::take(&mut self.log.filter));
-        let ModelOverrides { preset, weights, head, precision } = model;
+        let ModelOverrides {
+            preset,
+            weights,
+            head,
+            precision,
+        } = model;
         self.extract.preset = preset.unwrap_or(self.extract.preset);
         self.extract.weights = weights.or_else(|| self.extract.weights.take());
         self.extract.head = head.unwrap_or_else(|| std::mem::take(&mut self.extract.head));
@@ -207,7 +226,10 @@ impl Config {
             // Writing to a string cannot fail.
             let _ = write!(text, "\n[{section}]\n");
             for (key, value) in keys.as_table().into_iter().flatten() {
-                let comment = described.iter().find(|(name, _)| name == key).map_or("", |(_, comment)| comment);
+                let comment = described
+                    .iter()
+                    .find(|(name, _)| name == key)
+                    .map_or("", |(_, comment)| comment);
                 let _ = writeln!(text, "{}{key} = {value}", commented(comment));
             }
             for (key, comment) in described.iter().filter(|(key, _)| keys.get(key).is_none()) {
@@ -224,17 +246,27 @@ fn commented(comment: &str) -> String {
 
 /// Variables with two underscores; the others belong to single commands and tests.
 fn environment() -> Env {
-    Env::prefixed(PREFIX).filter(|name| name.as_str().contains("__")).split("__")
+    Env::prefixed(PREFIX)
+        .filter(|name| name.as_str().contains("__"))
+        .split("__")
 }
 
-/// A variable that names a section but not in the right form would silently do nothing: it is refused.
+/// A variable that names a section but not in the right form would silently do nothing: it is
+/// refused.
 fn check_variables(names: impl Iterator<Item = String>) -> Result<(), ConfigError> {
     for name in names {
-        let Some(rest) = name.strip_prefix(PREFIX).filter(|rest| !rest.contains("__")) else { continue };
+        let Some(rest) = name
+            .strip_prefix(PREFIX)
+            .filter(|rest| !rest.contains("__"))
+        else {
+            continue;
+        };
         let rest = rest.to_ascii_lowercase();
         let section = manual::SECTIONS.iter().find_map(|(section, keys)| {
             let key = rest.strip_prefix(section)?.strip_prefix('_')?;
-            keys.iter().any(|(known, _)| *known == key).then_some((section, key))
+            keys.iter()
+                .any(|(known, _)| *known == key)
+                .then_some((section, key))
         });
         if let Some((section, key)) = section {
             let hint = format!("{PREFIX}{}__{}", section.to_uppercase(), key.to_uppercase());
@@ -265,11 +297,21 @@ mod tests {
             head: Some(HeadChoice::File("head.safetensors".into())),
             ..Default::default()
         };
-        let overrides = Overrides { listen: Some("127.0.0.1:0".into()), model, ..Default::default() };
+        let overrides = Overrides {
+            listen: Some("127.0.0.1:0".into()),
+            model,
+            ..Default::default()
+        };
         let config = Config::load(Some(&path), &overrides).unwrap();
         assert_eq!(config.extract.weights, Some("own.safetensors".into()));
-        assert_eq!(config.extract.head, HeadChoice::File("head.safetensors".into()));
-        assert_eq!((config.http.listen.as_str(), config.http.max_page), ("127.0.0.1:0", 7));
+        assert_eq!(
+            config.extract.head,
+            HeadChoice::File("head.safetensors".into())
+        );
+        assert_eq!(
+            (config.http.listen.as_str(), config.http.max_page),
+            ("127.0.0.1:0", 7)
+        );
         assert_eq!(config.pipeline, PipelineConfig::default());
     }
 
@@ -284,12 +326,27 @@ mod tests {
             ("[store]\nreaders = 5", "store_reads"),
             ("[log]\nfilter = \"placeformer=loud\"", "loud"),
             ("[rerank]\nscales = []", "rerank.scales"),
-            ("[rerank]\nscales = [\"1+2\", \"1\", \"1+2\"]", "1+2 is given twice"),
-            ("[rerank]\ntolerance_patches = 0.0", "rerank.tolerance_patches"),
-            ("[rerank]\ntolerance_patches = nan", "rerank.tolerance_patches"),
-            ("[rerank]\ntolerance_patches = inf", "rerank.tolerance_patches"),
+            (
+                "[rerank]\nscales = [\"1+2\", \"1\", \"1+2\"]",
+                "1+2 is given twice",
+            ),
+            (
+                "[rerank]\ntolerance_patches = 0.0",
+                "rerank.tolerance_patches",
+            ),
+            (
+                "[rerank]\ntolerance_patches = nan",
+                "rerank.tolerance_patches",
+            ),
+            (
+                "[rerank]\ntolerance_patches = inf",
+                "rerank.tolerance_patches",
+            ),
             ("[rerank]\nmax_iterations = 0", "rerank.max_iterations"),
-            ("[rerank]\nmax_iterations = 1000001", "rerank.max_iterations"),
+            (
+                "[rerank]\nmax_iterations = 1000001",
+                "rerank.max_iterations",
+            ),
             ("[rerank]\nconfidence = 1.0", "rerank.confidence"),
             ("[rerank]\nconfidence = 0.0", "rerank.confidence"),
             ("[store]\npage_bytes = 5000", "store.page_bytes"),
@@ -303,7 +360,10 @@ mod tests {
             ("[image]\nmax_pixels = 0", "image.max_pixels"),
             ("[extract]\nexit_block = 12", "extract.exit_block"),
             ("[extract]\nhead = \"none\"", "extract.head"),
-            ("[[auth.keys]]\nname = \"a\"\nsha256 = \"12\"\nrole = \"read\"", "sha256"),
+            (
+                "[[auth.keys]]\nname = \"a\"\nsha256 = \"12\"\nrole = \"read\"",
+                "sha256",
+            ),
         ] {
             let error = from_toml(text).unwrap_err().to_string();
             assert!(error.contains(named), "{error:?} does not name {named:?}");
@@ -320,7 +380,10 @@ mod tests {
             role: crate::http::Role::Read,
             requests_per_second: None,
         });
-        assert_eq!(from_toml(&config.to_annotated_toml().unwrap()).unwrap(), config);
+        assert_eq!(
+            from_toml(&config.to_annotated_toml().unwrap()).unwrap(),
+            config
+        );
     }
 
     #[test]
@@ -328,14 +391,20 @@ mod tests {
         let sections = toml::Table::try_from(Config::default()).unwrap();
         for (section, keys) in &sections {
             for (key, _) in keys.as_table().unwrap() {
-                assert!(manual::section(section).iter().any(|(name, _)| name == key), "{section}.{key} is unexplained");
+                assert!(
+                    manual::section(section).iter().any(|(name, _)| name == key),
+                    "{section}.{key} is unexplained"
+                );
             }
         }
         for (section, keys) in manual::SECTIONS {
             for (key, _) in *keys {
                 let text = format!("[{section}]\n{key} = {{ nonsense = 1 }}");
                 let error = from_toml(&text).unwrap_err().to_string();
-                assert!(!error.contains("unknown field: found"), "{section}.{key} is explained but unknown: {error}");
+                assert!(
+                    !error.contains("unknown field: found"),
+                    "{section}.{key} is explained but unknown: {error}"
+                );
             }
         }
     }
@@ -345,7 +414,11 @@ mod tests {
         let names = |name: &str| check_variables(std::iter::once(name.to_owned()));
         let error = names("PLACEFORMER_HTTP_LISTEN").unwrap_err().to_string();
         assert!(error.contains("PLACEFORMER_HTTP__LISTEN"), "{error}");
-        for fine in ["PLACEFORMER_HTTP__LISTEN", "PLACEFORMER_CACHE", "HTTP_LISTEN"] {
+        for fine in [
+            "PLACEFORMER_HTTP__LISTEN",
+            "PLACEFORMER_CACHE",
+            "HTTP_LISTEN",
+        ] {
             assert!(names(fine).is_ok(), "{fine}");
         }
     }

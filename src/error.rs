@@ -1,7 +1,8 @@
 //! The one table of error codes: what a caller can rely on when something goes wrong.
 //!
-//! Every stage's error maps to one [`ErrorCode`]; the table gives its HTTP status, title and whether trying again
-//! may help. `problem+json`, OpenAPI, metrics and the documentation all read this table and nothing else.
+//! Every stage's error maps to one [`ErrorCode`]; the table gives its HTTP status, title and
+//! whether trying again may help. `problem+json`, OpenAPI, metrics and the documentation all read
+//! this table and nothing else.
 
 use serde::Serialize;
 
@@ -111,6 +112,10 @@ mod tests {
     fn codes_are_distinct_and_statuses_are_errors() {
         let names: HashSet<_> = ErrorCode::ALL.iter().map(|code| code.as_str()).collect();
         assert_eq!(names.len(), ErrorCode::ALL.len());
-        assert!(ErrorCode::ALL.iter().all(|code| (400..600).contains(&code.status())));
+        assert!(
+            ErrorCode::ALL
+                .iter()
+                .all(|code| (400..600).contains(&code.status()))
+        );
     }
 }

@@ -37,7 +37,10 @@ pub mod eval;
 pub mod extract;
 pub mod http;
 pub mod image;
-#[allow(unsafe_code, reason = "the one room for it: SIMD kernels, each with a scalar twin")]
+#[allow(
+    unsafe_code,
+    reason = "the one room for it: SIMD kernels, each with a scalar twin"
+)]
 pub mod kernels;
 pub mod ops;
 pub mod pipeline;

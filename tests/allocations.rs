@@ -1,9 +1,10 @@
-//! In the steady state, the stages of a query allocate their answers and little else: buffers are kept, matrices of
-//! similarities and scores never exist.
+//! In the steady state, the stages of a query allocate their answers and little else: buffers are
+//! kept, matrices of similarities and scores never exist.
 
 use placeformer::bench::scenes::{CANDIDATES, RerankScene, index_entry, unit_vector};
 use placeformer::extract::{
-    BlockWeights, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm, Precision, Preset, VitWeights,
+    BlockWeights, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm, Precision, Preset,
+    VitWeights,
 };
 use placeformer::kernels::Simd;
 use placeformer::rerank::{RerankConfig, Reranker};
@@ -19,8 +20,9 @@ static ALLOCATOR: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
 /// What the tests of this file allocate is counted together.
 static ALONE: Mutex<()> = Mutex::new(());
 
-/// The fewest bytes that one of several runs of `work` allocates: the first ones fill buffers and start threads, and a
-/// later one may be the first in which all threads need a buffer at the same moment.
+/// The fewest bytes that one of several runs of `work` allocates: the first ones fill buffers and
+/// start threads, and a later one may be the first in which all threads need a buffer at the same
+/// moment.
 fn steady_bytes<T>(mut work: impl FnMut() -> T) -> usize {
     let _alone = ALONE.lock().unwrap();
     let mut run = || {
@@ -34,13 +36,21 @@ fn steady_bytes<T>(mut work: impl FnMut() -> T) -> usize {
 }
 
 fn linear(outputs: usize, inputs: usize) -> Linear {
-    let weight = (0..outputs * inputs).map(|i| ((i * 37) % 101) as f32 / 1000.0 - 0.05).collect();
-    Linear { weight, bias: vec![0.01; outputs] }
+    let weight = (0..outputs * inputs)
+        .map(|i| ((i * 37) % 101) as f32 / 1000.0 - 0.05)
+        .collect();
+    Linear {
+        weight,
+        bias: vec![0.01; outputs],
+    }
 }
 
 fn weights(geometry: Geometry) -> VitWeights {
     let Geometry { dim, mlp_dim, .. } = geometry;
-    let norm = || Norm { weight: vec![1.0; dim], bias: vec![0.0; dim] };
+    let norm = || Norm {
+        weight: vec![1.0; dim],
+        bias: vec![0.0; dim],
+    };
     let block = || BlockWeights {
         norm1: norm(),
         qkv: linear(3 * dim, dim),
@@ -66,20 +76,51 @@ fn weights(geometry: Geometry) -> VitWeights {
 
 #[test]
 fn extraction_allocates_its_answer() {
-    let geometry = Geometry { depth: 3, dim: 128, heads: 2, patch: 14, mlp_dim: 512, layer_scale: false };
-    let input_size = ImageSize { width: 280, height: 210 };
-    let spec = EncoderSpec { input_size, exit_block: 2, token_norm: false, attention_block: 2 };
-    let image = ImageTensor { size: input_size, data: vec![0.3; 3 * 280 * 210] };
-    for precision in [Precision::F32, Precision::Bf16, Precision::Mixed, Precision::Int8] {
-        let Ok(encoder) = FusedEncoder::new(&weights(geometry), spec, Simd::best(), precision) else {
+    let geometry = Geometry {
+        depth: 3,
+        dim: 128,
+        heads: 2,
+        patch: 14,
+        mlp_dim: 512,
+        layer_scale: false,
+    };
+    let input_size = ImageSize {
+        width: 280,
+        height: 210,
+    };
+    let spec = EncoderSpec {
+        input_size,
+        exit_block: 2,
+        token_norm: false,
+        attention_block: 2,
+    };
+    let image = ImageTensor {
+        size: input_size,
+        data: vec![0.3; 3 * 280 * 210],
+    };
+    for precision in [
+        Precision::F32,
+        Precision::Bf16,
+        Precision::Mixed,
+        Precision::Int8,
+    ] {
+        let Ok(encoder) = FusedEncoder::new(&weights(geometry), spec, Simd::best(), precision)
+        else {
             println!("{precision} is not to be had on this CPU");
             assert_ne!(precision, Precision::F32);
             continue;
         };
         let answer = (1 + 20 * 15) * 128 * 4 + 2 * 20 * 15 * 4;
         let bytes = steady_bytes(|| encoder.encode(std::slice::from_ref(&image)).unwrap());
-        assert!(bytes >= answer, "{bytes} bytes cannot hold the answer: the counter does not count");
-        assert!(bytes < answer + (16 << 10), "{}: {bytes} bytes for an answer of {answer}", encoder.name());
+        assert!(
+            bytes >= answer,
+            "{bytes} bytes cannot hold the answer: the counter does not count"
+        );
+        assert!(
+            bytes < answer + (16 << 10),
+            "{}: {bytes} bytes for an answer of {answer}",
+            encoder.name()
+        );
     }
 }
 
@@ -87,12 +128,26 @@ fn extraction_allocates_its_answer() {
 fn reranking_allocates_no_matrices() {
     let scene = RerankScene::new(0.4);
     let query = PackedPatches::quantise(&scene.query);
-    let candidates: Vec<_> = scene.candidates.iter().map(PackedPatches::quantise).collect();
+    let candidates: Vec<_> = scene
+        .candidates
+        .iter()
+        .map(PackedPatches::quantise)
+        .collect();
     let reranker = Reranker::new(RerankConfig::default());
-    let bytes = steady_bytes(|| reranker.rerank(&query, candidates.len(), |i| Ok::<_, ()>(&candidates[i]), None));
+    let bytes = steady_bytes(|| {
+        reranker.rerank(
+            &query,
+            candidates.len(),
+            |i| Ok::<_, ()>(&candidates[i]),
+            None,
+        )
+    });
     // One similarity matrix of the smallest combination is 640 kB of f32, for each candidate.
     let per_candidate = bytes / CANDIDATES;
-    assert!(per_candidate < 64 << 10, "{per_candidate} bytes per candidate");
+    assert!(
+        per_candidate < 64 << 10,
+        "{per_candidate} bytes per candidate"
+    );
 }
 
 #[test]

@@ -1,7 +1,8 @@
 //! The dashboard and the alerts ask only for series that the service has.
 //!
-//! Every metric name, and every label value that is written out in a query, must appear in the text of `/metrics`
-//! right after start: a renamed series or reason would otherwise leave an alert that can never fire.
+//! Every metric name, and every label value that is written out in a query, must appear in the text
+//! of `/metrics` right after start: a renamed series or reason would otherwise leave an alert that
+//! can never fire.
 
 use placeformer::ops::Metrics;
 use std::collections::BTreeSet;
@@ -10,7 +11,9 @@ use std::path::Path;
 const LABELS: &[&str] = &["reason", "stage", "component", "kind", "result"];
 
 fn read(file: &str) -> String {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docker").join(file);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("docker")
+        .join(file);
     std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
@@ -20,22 +23,37 @@ fn exposition() -> String {
     metrics.render().expect("every series renders")
 }
 
-/// The expressions of the dashboard (panels and annotations) and of the alert rules, with the file they come from.
+/// The expressions of the dashboard (panels and annotations) and of the alert rules, with the file
+/// they come from.
 fn expressions() -> Vec<(&'static str, String)> {
     let dashboard: serde_json::Value =
-        serde_json::from_str(&read("grafana/dashboards/placeformer.json")).expect("the dashboard is JSON");
+        serde_json::from_str(&read("grafana/dashboards/placeformer.json"))
+            .expect("the dashboard is JSON");
     let mut found = Vec::new();
     collect(&dashboard, &mut found);
-    assert!(found.len() > 20, "the dashboard has only {} queries", found.len());
+    assert!(
+        found.len() > 20,
+        "the dashboard has only {} queries",
+        found.len()
+    );
     let rules = read("prometheus/alerts.yml");
     // Comments, names and annotations hold no metric names but those of the expressions.
-    found.into_iter().map(|expr| ("dashboard", expr)).chain([("alerts", rules)]).collect()
+    found
+        .into_iter()
+        .map(|expr| ("dashboard", expr))
+        .chain([("alerts", rules)])
+        .collect()
 }
 
 fn collect(value: &serde_json::Value, into: &mut Vec<String>) {
     match value {
         serde_json::Value::Object(fields) => {
-            into.extend(fields.get("expr").and_then(|expr| expr.as_str()).map(str::to_owned));
+            into.extend(
+                fields
+                    .get("expr")
+                    .and_then(|expr| expr.as_str())
+                    .map(str::to_owned),
+            );
             fields.values().for_each(|field| collect(field, into));
         }
         serde_json::Value::Array(items) => items.iter().for_each(|item| collect(item, into)),
@@ -57,7 +75,10 @@ fn label_values(query: &str) -> Vec<(&'static str, String)> {
     for label in LABELS {
         for (at, _) in query.match_indices(&format!("{label}=")) {
             let matcher = &query[at + label.len() + 1..];
-            let Some(value) = matcher.trim_start_matches('~').strip_prefix('"').and_then(|v| v.split('"').next())
+            let Some(value) = matcher
+                .trim_start_matches('~')
+                .strip_prefix('"')
+                .and_then(|v| v.split('"').next())
             else {
                 continue;
             };
@@ -70,36 +91,72 @@ fn label_values(query: &str) -> Vec<(&'static str, String)> {
 /// What of `query` is not in `exposed`.
 fn missing(query: &str, exposed: &str) -> Vec<String> {
     let known = |name: &str| {
-        exposed.lines().any(|line| line.starts_with(&format!("{name}{{")) || line.starts_with(&format!("{name} ")))
+        exposed.lines().any(|line| {
+            line.starts_with(&format!("{name}{{")) || line.starts_with(&format!("{name} "))
+        })
     };
-    let names = metric_names(query).into_iter().filter(|name| !known(name)).map(str::to_owned);
-    let values = label_values(query).into_iter().map(|(label, value)| format!("{label}=\"{value}\""));
-    names.chain(values.filter(|matcher| !exposed.contains(matcher))).collect()
+    let names = metric_names(query)
+        .into_iter()
+        .filter(|name| !known(name))
+        .map(str::to_owned);
+    let values = label_values(query)
+        .into_iter()
+        .map(|(label, value)| format!("{label}=\"{value}\""));
+    names
+        .chain(values.filter(|matcher| !exposed.contains(matcher)))
+        .collect()
 }
 
 #[test]
 fn dashboard_and_alerts_ask_only_for_series_that_exist() {
     let exposed = exposition();
     for (file, query) in expressions() {
-        assert_eq!(missing(&query, &exposed), Vec::<String>::new(), "in the {file}: {query}");
+        assert_eq!(
+            missing(&query, &exposed),
+            Vec::<String>::new(),
+            "in the {file}: {query}"
+        );
     }
 }
 
 #[test]
 fn every_series_of_the_service_is_watched_somewhere() {
-    let all: String = expressions().into_iter().map(|(_, query)| query + "\n").collect();
+    let all: String = expressions()
+        .into_iter()
+        .map(|(_, query)| query + "\n")
+        .collect();
     let exposed = exposition();
-    let families =
-        exposed.lines().filter_map(|line| line.strip_prefix("# TYPE ")).filter_map(|line| line.split(' ').next());
+    let families = exposed
+        .lines()
+        .filter_map(|line| line.strip_prefix("# TYPE "))
+        .filter_map(|line| line.split(' ').next());
     for family in families.filter(|family| family.starts_with("placeformer_")) {
-        assert!(all.contains(family), "{family} is on no dashboard and in no alert");
+        assert!(
+            all.contains(family),
+            "{family} is on no dashboard and in no alert"
+        );
     }
 }
 
 #[test]
 fn a_renamed_series_or_reason_is_noticed() {
     let exposed = exposition();
-    assert_eq!(missing("rate(placeformer_gone_total[5m])", &exposed), ["placeformer_gone_total"]);
-    assert_eq!(missing("placeformer_rejected_total{reason=~\"queue_full|bored\"}", &exposed), ["reason=\"bored\""]);
-    assert_eq!(missing("placeformer_stage_duration_seconds_bucket{stage=\"rerank\"}", &exposed), Vec::<String>::new());
+    assert_eq!(
+        missing("rate(placeformer_gone_total[5m])", &exposed),
+        ["placeformer_gone_total"]
+    );
+    assert_eq!(
+        missing(
+            "placeformer_rejected_total{reason=~\"queue_full|bored\"}",
+            &exposed
+        ),
+        ["reason=\"bored\""]
+    );
+    assert_eq!(
+        missing(
+            "placeformer_stage_duration_seconds_bucket{stage=\"rerank\"}",
+            &exposed
+        ),
+        Vec::<String>::new()
+    );
 }

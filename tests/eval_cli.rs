@@ -1,5 +1,5 @@
-//! What `eval`, `import` and `match` say to wrong arguments, before any model is loaded; and `eval` from photos to
-//! figures, files and pages, on a small drawn town.
+//! What `eval`, `import` and `match` say to wrong arguments, before any model is loaded; and `eval`
+//! from photos to figures, files and pages, on a small drawn town.
 
 #[path = "common/town.rs"]
 mod town;
@@ -12,9 +12,16 @@ use town::{SIZE, has_model, prints, succeeds, town};
 
 fn placeformer(arguments: &[&str], folder: &Path) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    // An empty cache and no network address: whatever gets as far as the model fails for that reason instead.
-    command.args(arguments).env("PLACEFORMER_CACHE", folder.join("cache")).env("HF_ENDPOINT", "http://127.0.0.1:9");
-    command.env_remove("PLACEFORMER_WEIGHTS").env_remove("PLACEFORMER_CONFIG").env("PATH", "");
+    // An empty cache and no network address: whatever gets as far as the model fails for that
+    // reason instead.
+    command
+        .args(arguments)
+        .env("PLACEFORMER_CACHE", folder.join("cache"))
+        .env("HF_ENDPOINT", "http://127.0.0.1:9");
+    command
+        .env_remove("PLACEFORMER_WEIGHTS")
+        .env_remove("PLACEFORMER_CONFIG")
+        .env("PATH", "");
     command.output().expect("the binary was built")
 }
 
@@ -30,12 +37,45 @@ fn eval_needs_one_whole_description_of_the_data() {
     for (arguments, part) in [
         (&["eval"][..], "--dataset"),
         (&["eval", "--dataset", "pitts30k"], "--root"),
-        (&["eval", "--database", "a", "--queries", "b"], "--ground-truth"),
-        (&["eval", "--dataset", "pitts300k", "--root", "x"], "pitts30k"),
-        (&["eval", "--dataset", "utm", "--root", "/nowhere"], "@utm_east@utm_north@"),
-        (&["eval", "--dataset", "utm", "--root", "/nowhere", "--radius=-1"], "radius"),
-        (&["eval", "--dataset", "msls-val", "--root", "/nowhere"], "train_val/<city>"),
-        (&["eval", "--dataset", "utm", "--root", "/nowhere", "--scales", "4"], "not a scale"),
+        (
+            &["eval", "--database", "a", "--queries", "b"],
+            "--ground-truth",
+        ),
+        (
+            &["eval", "--dataset", "pitts300k", "--root", "x"],
+            "pitts30k",
+        ),
+        (
+            &["eval", "--dataset", "utm", "--root", "/nowhere"],
+            "@utm_east@utm_north@",
+        ),
+        (
+            &[
+                "eval",
+                "--dataset",
+                "utm",
+                "--root",
+                "/nowhere",
+                "--radius=-1",
+            ],
+            "radius",
+        ),
+        (
+            &["eval", "--dataset", "msls-val", "--root", "/nowhere"],
+            "train_val/<city>",
+        ),
+        (
+            &[
+                "eval",
+                "--dataset",
+                "utm",
+                "--root",
+                "/nowhere",
+                "--scales",
+                "4",
+            ],
+            "not a scale",
+        ),
     ] {
         let error = refusal(arguments, folder.path());
         assert!(error.contains(part), "{arguments:?}: {error}");
@@ -48,12 +88,79 @@ fn eval_calibrate_takes_the_same_data_and_its_own_options() {
     for (arguments, part) in [
         (&["eval", "calibrate"][..], "--dataset"),
         (&["eval", "calibrate", "--dataset", "pitts30k"], "--root"),
-        (&["eval", "calibrate", "--dataset", "utm", "--root", "/nowhere"], "@utm_east@utm_north@"),
-        (&["eval", "calibrate", "--dataset", "utm", "--root", "/nowhere", "--target-precision", "1.5"], "0.99"),
-        (&["eval", "calibrate", "--dataset", "utm", "--root", "/nowhere", "--candidates", "0"], "--candidates"),
-        (&["eval", "calibrate", "--dataset", "utm", "--root", "/nowhere", "--leave-out", "no"], "never"),
-        (&["eval", "calibrate", "--dataset", "utm", "--root", "/nowhere", "--no-rerank"], "--no-rerank"),
-        (&["eval", "--dataset", "utm", "--root", "/nowhere", "calibrate"], "calibrate"),
+        (
+            &[
+                "eval",
+                "calibrate",
+                "--dataset",
+                "utm",
+                "--root",
+                "/nowhere",
+            ],
+            "@utm_east@utm_north@",
+        ),
+        (
+            &[
+                "eval",
+                "calibrate",
+                "--dataset",
+                "utm",
+                "--root",
+                "/nowhere",
+                "--target-precision",
+                "1.5",
+            ],
+            "0.99",
+        ),
+        (
+            &[
+                "eval",
+                "calibrate",
+                "--dataset",
+                "utm",
+                "--root",
+                "/nowhere",
+                "--candidates",
+                "0",
+            ],
+            "--candidates",
+        ),
+        (
+            &[
+                "eval",
+                "calibrate",
+                "--dataset",
+                "utm",
+                "--root",
+                "/nowhere",
+                "--leave-out",
+                "no",
+            ],
+            "never",
+        ),
+        (
+            &[
+                "eval",
+                "calibrate",
+                "--dataset",
+                "utm",
+                "--root",
+                "/nowhere",
+                "--no-rerank",
+            ],
+            "--no-rerank",
+        ),
+        (
+            &[
+                "eval",
+                "--dataset",
+                "utm",
+                "--root",
+                "/nowhere",
+                "calibrate",
+            ],
+            "calibrate",
+        ),
     ] {
         let error = refusal(arguments, folder.path());
         assert!(error.contains(part), "{arguments:?}: {error}");
@@ -66,7 +173,10 @@ fn eval_calibrate_says_where_unknown_places_come_from() {
     let output = placeformer(&["eval", "calibrate", "--help"], folder.path());
     let help = String::from_utf8_lossy(&output.stdout);
     let flowing = help.split_whitespace().collect::<Vec<_>>().join(" ");
-    assert!(output.status.success() && flowing.contains("its own place left out of the database"), "{help}");
+    assert!(
+        output.status.success() && flowing.contains("its own place left out of the database"),
+        "{help}"
+    );
 }
 
 #[test]
@@ -77,7 +187,11 @@ fn eval_names_images_the_ground_truth_invents() {
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         std::fs::write(path, b"x").unwrap();
     }
-    std::fs::write(folder.path().join("ground_truth.csv"), "query,reference\nq.jpg,missing.jpg\n").unwrap();
+    std::fs::write(
+        folder.path().join("ground_truth.csv"),
+        "query,reference\nq.jpg,missing.jpg\n",
+    )
+    .unwrap();
     let root = folder.path().to_str().unwrap();
     let error = refusal(&["eval", "--dataset", "csv", "--root", root], folder.path());
     assert!(error.contains("missing.jpg"), "{error}");
@@ -88,35 +202,75 @@ fn import_needs_a_target_photos_and_a_reachable_server() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path().to_str().unwrap();
     assert!(refusal(&["import", root, "--map", "m"], folder.path()).contains("--server"));
-    let nowhere = ["import", root, "--map", "m", "--server", "http://127.0.0.1:9", "--attempts", "1"];
+    let nowhere = [
+        "import",
+        root,
+        "--map",
+        "m",
+        "--server",
+        "http://127.0.0.1:9",
+        "--attempts",
+        "1",
+    ];
     assert!(refusal(&nowhere, folder.path()).contains("holds no JPEG"));
     std::fs::write(folder.path().join("a.jpg"), b"x").unwrap();
     assert!(refusal(&nowhere, folder.path()).contains("127.0.0.1:9"));
-    let bad_map = ["import", root, "--map", "a b", "--server", "http://127.0.0.1:9"];
+    let bad_map = [
+        "import",
+        root,
+        "--map",
+        "a b",
+        "--server",
+        "http://127.0.0.1:9",
+    ];
     assert!(refusal(&bad_map, folder.path()).contains("1 to 64"));
 }
 
 #[test]
 fn match_refuses_a_picture_it_cannot_write_before_loading_the_model() {
     let folder = tempfile::tempdir().unwrap();
-    let error = refusal(&["match", "a.jpg", "b.jpg", "--out", "match.gif"], folder.path());
+    let error = refusal(
+        &["match", "a.jpg", "b.jpg", "--out", "match.gif"],
+        folder.path(),
+    );
     assert!(error.contains(".png"), "{error}");
 }
 
 /// `eval` on the town, with everything kept below `folder`.
 fn eval<'a>(more: &[&'a str]) -> Vec<&'a str> {
-    [&["eval", "--dataset", "csv", "--root", "town", "--input-size", SIZE, "--cache", "cache"], more].concat()
+    [
+        &[
+            "eval",
+            "--dataset",
+            "csv",
+            "--root",
+            "town",
+            "--input-size",
+            SIZE,
+            "--cache",
+            "cache",
+        ],
+        more,
+    ]
+    .concat()
 }
 
 fn keys(value: &Value) -> Vec<&str> {
-    value.as_object().expect("an object").keys().map(String::as_str).collect()
+    value
+        .as_object()
+        .expect("an object")
+        .keys()
+        .map(String::as_str)
+        .collect()
 }
 
 /// Queries that are mapped, each with the reference that shows its place.
 fn pairs(folder: &Path) -> Vec<(String, String)> {
     let text = std::fs::read_to_string(folder.join("town/ground_truth.csv")).unwrap();
     let rows = text.lines().skip(1).filter_map(|row| row.split_once(','));
-    rows.filter(|row| !row.1.is_empty()).map(|(query, reference)| (query.to_owned(), reference.to_owned())).collect()
+    rows.filter(|row| !row.1.is_empty())
+        .map(|(query, reference)| (query.to_owned(), reference.to_owned()))
+        .collect()
 }
 
 #[test]
@@ -127,30 +281,57 @@ fn a_run_measures_resumes_and_survives_lost_images() {
     let town = town("8", "2");
     let folder = town.path();
     let (text, said) = prints(folder, &eval(&["--json", "out.json"]));
-    assert!(text.contains("R@1") && !said.contains("described 0 images"), "{text}{said}");
-    let json: Value = serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
-    let queries = std::fs::read_dir(folder.join("town/queries")).unwrap().count();
+    assert!(
+        text.contains("R@1") && !said.contains("described 0 images"),
+        "{text}{said}"
+    );
+    let json: Value =
+        serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
+    let queries = std::fs::read_dir(folder.join("town/queries"))
+        .unwrap()
+        .count();
     assert_eq!(json["queries"], queries);
     for stage in ["global", "reranked"] {
         let recall = &json["recall"][stage];
-        let mut depths: Vec<u32> = keys(recall).iter().map(|key| key.parse().unwrap()).collect();
+        let mut depths: Vec<u32> = keys(recall)
+            .iter()
+            .map(|key| key.parse().unwrap())
+            .collect();
         depths.sort_unstable();
         assert_eq!(depths, [1, 5, 10, 20]);
         let at = |k: &str| recall[k].as_f64().unwrap();
-        assert!(at("1") <= at("5") && at("5") <= at("10") && at("20") == 100.0, "{recall}");
+        assert!(
+            at("1") <= at("5") && at("5") <= at("10") && at("20") == 100.0,
+            "{recall}"
+        );
     }
-    assert!(["extract", "search", "rerank"].iter().all(|stage| json["seconds"][stage].as_f64().unwrap() > 0.0));
+    assert!(
+        ["extract", "search", "rerank"]
+            .iter()
+            .all(|stage| json["seconds"][stage].as_f64().unwrap() > 0.0)
+    );
     assert!(json["bytes_per_reference"].as_f64().unwrap() > 1000.0);
     assert_eq!(json["config"]["candidates"], 100);
 
     // One query has a second right answer and loses the first; another loses its only one.
-    let [first, second, third, ..] = &pairs(folder)[..] else { panic!("the town is too small") };
+    let [first, second, third, ..] = &pairs(folder)[..] else {
+        panic!("the town is too small")
+    };
     let path = folder.join("town/ground_truth.csv");
-    let more = format!("{}{},{}\n", std::fs::read_to_string(&path).unwrap(), first.0, second.1);
+    let more = format!(
+        "{}{},{}\n",
+        std::fs::read_to_string(&path).unwrap(),
+        first.0,
+        second.1
+    );
     std::fs::write(&path, more).unwrap();
-    assert!(first.1 < second.1, "the first in the database is the one that goes");
+    assert!(
+        first.1 < second.1,
+        "the first in the database is the one that goes"
+    );
     let lost = [&first.1, &third.1];
-    lost.iter().for_each(|name| std::fs::write(folder.join("town/database").join(name), b"torn").unwrap());
+    lost.iter()
+        .for_each(|name| std::fs::write(folder.join("town/database").join(name), b"torn").unwrap());
     let kept = format!("a right answer<br><span class=\"soft\">{}</span>", second.1);
     let (text, said) = prints(folder, &eval(&["--html", "out.html", "--pictures", "16"]));
     assert!(said.contains("described 0 images"), "{said}");
@@ -173,7 +354,10 @@ fn a_prediction_file_has_a_line_for_every_query() {
         let target = folder.join("msls/test/miami").join(side);
         std::fs::create_dir_all(target.join("images")).unwrap();
         let mut index = ",key,all\n".to_owned();
-        let mut names: Vec<_> = std::fs::read_dir(folder.join(from)).unwrap().map(|e| e.unwrap().path()).collect();
+        let mut names: Vec<_> = std::fs::read_dir(folder.join(from))
+            .unwrap()
+            .map(|e| e.unwrap().path())
+            .collect();
         names.sort();
         for (row, path) in names.iter().enumerate() {
             std::fs::copy(path, target.join("images").join(format!("{side}{row}.jpg"))).unwrap();
@@ -181,21 +365,53 @@ fn a_prediction_file_has_a_line_for_every_query() {
         }
         std::fs::write(target.join("subtask_index.csv"), index).unwrap();
     }
-    std::fs::write(folder.join("msls/test/miami/query/images/query1.jpg"), b"torn").unwrap();
-    let arguments =
-        ["eval", "--dataset", "msls-test", "--root", "msls", "--cities", "miami", "--input-size", SIZE, "--cache", "c"];
-    let (_, said) = prints(folder, &[&arguments[..], &["--predictions", "out.txt"]].concat());
-    assert!(said.contains("1 of the queries could not be answered"), "{said}");
+    std::fs::write(
+        folder.join("msls/test/miami/query/images/query1.jpg"),
+        b"torn",
+    )
+    .unwrap();
+    let arguments = [
+        "eval",
+        "--dataset",
+        "msls-test",
+        "--root",
+        "msls",
+        "--cities",
+        "miami",
+        "--input-size",
+        SIZE,
+        "--cache",
+        "c",
+    ];
+    let (_, said) = prints(
+        folder,
+        &[&arguments[..], &["--predictions", "out.txt"]].concat(),
+    );
+    assert!(
+        said.contains("1 of the queries could not be answered"),
+        "{said}"
+    );
     let text = std::fs::read_to_string(folder.join("out.txt")).unwrap();
     let lines: Vec<Vec<&str>> = text.lines().map(|line| line.split(' ').collect()).collect();
-    let queries = std::fs::read_dir(folder.join("town/queries")).unwrap().count();
-    let references = std::fs::read_dir(folder.join("town/database")).unwrap().count();
+    let queries = std::fs::read_dir(folder.join("town/queries"))
+        .unwrap()
+        .count();
+    let references = std::fs::read_dir(folder.join("town/database"))
+        .unwrap()
+        .count();
     let asked: Vec<String> = (0..queries).map(|row| format!("query{row}")).collect();
     assert_eq!(lines.iter().map(|line| line[0]).collect::<Vec<_>>(), asked);
     for line in &lines {
         let answers: std::collections::BTreeSet<_> = line[1..].iter().collect();
-        assert_eq!((line.len(), answers.len()), (1 + references, references), "{line:?}");
-        assert!(answers.iter().all(|key| key.starts_with("database")), "{line:?}");
+        assert_eq!(
+            (line.len(), answers.len()),
+            (1 + references, references),
+            "{line:?}"
+        );
+        assert!(
+            answers.iter().all(|key| key.starts_with("database")),
+            "{line:?}"
+        );
     }
 }
 
@@ -206,24 +422,60 @@ fn a_calibration_is_fitted_and_judged_elsewhere() {
     }
     let town = town("8", "2");
     let folder = town.path();
-    let calibrate = ["eval", "calibrate", "--dataset", "csv", "--root", "town", "--input-size", SIZE];
-    let fit = ["--cache", "cache", "--leave-out", "always", "--target-precision", "0.8", "--out", "own.json"];
+    let calibrate = [
+        "eval",
+        "calibrate",
+        "--dataset",
+        "csv",
+        "--root",
+        "town",
+        "--input-size",
+        SIZE,
+    ];
+    let fit = [
+        "--cache",
+        "cache",
+        "--leave-out",
+        "always",
+        "--target-precision",
+        "0.8",
+        "--out",
+        "own.json",
+    ];
     let text = succeeds(folder, &[&calibrate[..], &fit].concat());
     assert!(text.contains("re-ranked"), "{text}");
     let bytes = std::fs::read(folder.join("own.json")).unwrap();
     let calibration: Calibration = serde_json::from_slice(&bytes).unwrap();
     assert!(calibration.curve(true).right > 0 && calibration.curve(true).wrong > 0);
     // The same answers judge it: as many again cannot be right.
-    let more = ["--leave-out", "--calibration", "own.json", "--json", "out.json", "--html", "out.html"];
+    let more = [
+        "--leave-out",
+        "--calibration",
+        "own.json",
+        "--json",
+        "out.json",
+        "--html",
+        "out.html",
+    ];
     let text = succeeds(folder, &eval(&[&more[..], &["--pictures", "0"]].concat()));
     assert!(text.contains("of the calibration given"), "{text}");
-    let json: Value = serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
+    let json: Value =
+        serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
     assert_eq!(json["queries_left_out"], json["queries_with_match"]);
-    assert!(json["given_calibration"]["expected_calibration_error"].as_f64().unwrap() < 0.5, "{json}");
+    assert!(
+        json["given_calibration"]["expected_calibration_error"]
+            .as_f64()
+            .unwrap()
+            < 0.5,
+        "{json}"
+    );
     let page = std::fs::read_to_string(folder.join("out.html")).unwrap();
     assert!(page.contains("the one given, error"));
     // It holds for this re-ranking only.
-    let error = town::refusal(folder, &eval(&["--calibration", "own.json", "--scales", "1"]));
+    let error = town::refusal(
+        folder,
+        &eval(&["--calibration", "own.json", "--scales", "1"]),
+    );
     assert!(error.contains("re-ranking"), "{error}");
 }
 
@@ -234,8 +486,12 @@ fn the_ablation_marks_its_base_once_on_every_axis() {
     }
     let town = town("2", "1");
     let folder = town.path();
-    let text = succeeds(folder, &eval(&["--ablate", "--json", "out.json", "--no-rerank"]));
-    let json: Value = serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
+    let text = succeeds(
+        folder,
+        &eval(&["--ablate", "--json", "out.json", "--no-rerank"]),
+    );
+    let json: Value =
+        serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
     let rows = json["ablation"].as_array().unwrap();
     let mut stars = std::collections::BTreeMap::new();
     for row in rows {
@@ -244,13 +500,30 @@ fn the_ablation_marks_its_base_once_on_every_axis() {
     }
     assert_eq!(
         stars.into_iter().collect::<Vec<_>>(),
-        ["backbone", "caps", "codec", "exit block", "input size", "scales", "tau"].map(|axis| (axis, 1))
+        [
+            "backbone",
+            "caps",
+            "codec",
+            "exit block",
+            "input size",
+            "scales",
+            "tau"
+        ]
+        .map(|axis| (axis, 1))
     );
     // The base is the base on whatever axis.
-    let base: Vec<&Value> = rows.iter().filter(|row| row["setting"].as_str().unwrap().ends_with('*')).collect();
-    assert!(base.iter().all(|row| row["recall"] == base[0]["recall"]), "{text}");
+    let base: Vec<&Value> = rows
+        .iter()
+        .filter(|row| row["setting"].as_str().unwrap().ends_with('*'))
+        .collect();
+    assert!(
+        base.iter().all(|row| row["recall"] == base[0]["recall"]),
+        "{text}"
+    );
     assert_eq!(
-        text.lines().filter(|line| line.starts_with("codec")).count(),
+        text.lines()
+            .filter(|line| line.starts_with("codec"))
+            .count(),
         rows.iter().filter(|row| row["axis"] == "codec").count()
     );
 }

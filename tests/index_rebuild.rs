@@ -1,5 +1,5 @@
-//! The index is a cache of the store: after any history, a service rebuilt from the store answers as the live one does,
-//! and both as a plain model of what was asked of them says.
+//! The index is a cache of the store: after any history, a service rebuilt from the store answers
+//! as the live one does, and both as a plain model of what was asked of them says.
 
 #[path = "common/places.rs"]
 mod places;
@@ -10,10 +10,12 @@ use placeformer::config::Config;
 use placeformer::error::ErrorCode;
 use placeformer::pipeline::{IngestRequest, QueryOptions, QueryRequest, Service};
 use placeformer::search::{IndexBuilder, IndexEntry, MapIndex};
-use placeformer::store::{Inserted, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, apply_patch};
+use placeformer::store::{
+    Inserted, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, apply_patch,
+};
 use placeformer::types::{
-    ContentHash, GLOBAL_DIM, GeoCircle, GeoPoint, MapName, NewReference, Reference, ReferenceFields, ReferenceFilter,
-    ReferenceId,
+    ContentHash, GLOBAL_DIM, GeoCircle, GeoPoint, MapName, NewReference, Reference,
+    ReferenceFields, ReferenceFilter, ReferenceId,
 };
 use places::{map, named_reference, reference, unit_vector};
 use proptest::prelude::*;
@@ -75,8 +77,19 @@ fn minute(minute: u8) -> OffsetDateTime {
 }
 
 fn start(directory: &Path) -> Arc<Service> {
-    let store = StoreConfig { reserve_bytes: 1 << 20, ..Default::default() };
-    support::open(directory, FakeSource::new("fake-1"), Config { store, ..Default::default() }).1
+    let store = StoreConfig {
+        reserve_bytes: 1 << 20,
+        ..Default::default()
+    };
+    support::open(
+        directory,
+        FakeSource::new("fake-1"),
+        Config {
+            store,
+            ..Default::default()
+        },
+    )
+    .1
 }
 
 /// What there must be, in the order of identities.
@@ -89,7 +102,11 @@ impl Model {
     }
 
     fn of(&self, map: &MapName) -> Vec<Reference> {
-        self.0.values().filter(|reference| reference.map == *map).cloned().collect()
+        self.0
+            .values()
+            .filter(|reference| reference.map == *map)
+            .cloned()
+            .collect()
     }
 }
 
@@ -109,7 +126,14 @@ impl History {
         let service = Some(start(directory.path()));
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let (model, gone, maps) = (Model::default(), Vec::new(), Default::default());
-        Self { directory, runtime, service, model, gone, maps }
+        Self {
+            directory,
+            runtime,
+            service,
+            model,
+            gone,
+            maps,
+        }
     }
 
     fn restart(&mut self) {
@@ -120,12 +144,20 @@ impl History {
     }
 
     fn service(&self) -> &Arc<Service> {
-        self.service.as_ref().expect("it is taken only to be replaced")
+        self.service
+            .as_ref()
+            .expect("it is taken only to be replaced")
     }
 
     fn run(&mut self, operation: Operation) {
         match operation {
-            Operation::Ingest { map, photo, name, place: at, minute: when } => {
+            Operation::Ingest {
+                map,
+                photo,
+                name,
+                place: at,
+                minute: when,
+            } => {
                 let fields = ReferenceFields {
                     external_id: name.map(|name| format!("photo {name}").parse().unwrap()),
                     location: at.map(place),
@@ -134,32 +166,46 @@ impl History {
                 };
                 self.ingest(name_of(map), photo, fields);
             }
-            Operation::Patch { which, place: at, minute: when } => {
-                let Some(id) = self.model.pick(which) else { return };
+            Operation::Patch {
+                which,
+                place: at,
+                minute: when,
+            } => {
+                let Some(id) = self.model.pick(which) else {
+                    return;
+                };
                 let patch = ReferencePatch {
                     location: at.map(|at| at.map(place)),
                     captured_at: when.map(|when| when.map(minute)),
                     ..Default::default()
                 };
-                let changed = self.runtime.block_on(self.service().update(id, patch.clone())).unwrap();
+                let changed = self
+                    .runtime
+                    .block_on(self.service().update(id, patch.clone()))
+                    .unwrap();
                 let expected = self.model.0.get_mut(&id).unwrap();
                 apply_patch(&mut expected.fields, patch);
                 assert_eq!(changed, *expected);
             }
             Operation::Delete(which) => {
-                let Some(id) = self.model.pick(which) else { return };
+                let Some(id) = self.model.pick(which) else {
+                    return;
+                };
                 let deleted = self.runtime.block_on(self.service().delete(id)).unwrap();
                 assert_eq!(Some(deleted), self.model.0.remove(&id));
                 self.gone.push(id);
             }
             Operation::DeleteMap(map) => {
                 let name = name_of(map);
-                let deleted = self.runtime.block_on(self.service().delete_map(name.clone()));
+                let deleted = self
+                    .runtime
+                    .block_on(self.service().delete_map(name.clone()));
                 match self.maps.remove(&name) {
                     true => assert_eq!(deleted.unwrap(), self.model.of(&name).len() as u64),
                     false => assert_eq!(deleted.unwrap_err().code(), ErrorCode::MapNotFound),
                 }
-                self.gone.extend(self.model.of(&name).iter().map(|reference| reference.id));
+                self.gone
+                    .extend(self.model.of(&name).iter().map(|reference| reference.id));
                 self.model.0.retain(|_, reference| reference.map != name);
             }
             Operation::Restart => self.restart(),
@@ -170,10 +216,15 @@ impl History {
         let image = Bytes::from(picture(photo));
         let content = ContentHash::of(&image);
         let named = |reference: &&Reference| {
-            reference.fields.external_id.is_some() && reference.fields.external_id == fields.external_id
+            reference.fields.external_id.is_some()
+                && reference.fields.external_id == fields.external_id
         };
         let holder = self.model.of(&map).iter().find(named).cloned();
-        let request = IngestRequest { map: map.clone(), fields: fields.clone(), image };
+        let request = IngestRequest {
+            map: map.clone(),
+            fields: fields.clone(),
+            image,
+        };
         let answer = self.runtime.block_on(self.service().ingest(request));
         match holder {
             Some(holder) if holder.content_hash == content => {
@@ -184,7 +235,10 @@ impl History {
             None => {
                 let answer = answer.unwrap();
                 assert!(answer.created);
-                assert_eq!((&answer.reference.fields, answer.reference.content_hash), (&fields, content));
+                assert_eq!(
+                    (&answer.reference.fields, answer.reference.content_hash),
+                    (&fields, content)
+                );
                 assert_eq!(answer.reference.map, map);
                 self.maps.insert(map);
                 self.model.0.insert(answer.reference.id, answer.reference);
@@ -192,7 +246,8 @@ impl History {
         }
     }
 
-    /// Everything that can be read of the service equals the model; what a search finds is returned.
+    /// Everything that can be read of the service equals the model; what a search finds is
+    /// returned.
     fn check(&self) -> Vec<Vec<(ReferenceId, f32)>> {
         let service = self.service();
         self.runtime.block_on(async {
@@ -200,11 +255,20 @@ impl History {
                 assert_eq!(service.reference(*id).await.unwrap(), *expected);
             }
             for id in &self.gone {
-                assert_eq!(service.reference(*id).await.unwrap_err().code(), ErrorCode::ReferenceNotFound);
+                assert_eq!(
+                    service.reference(*id).await.unwrap_err().code(),
+                    ErrorCode::ReferenceNotFound
+                );
             }
             let maps = service.maps().await.unwrap();
-            assert_eq!(maps.iter().map(|map| &map.name).collect::<Vec<_>>(), self.maps.iter().collect::<Vec<_>>());
-            assert_eq!(listed(service, None).await, self.model.0.values().cloned().collect::<Vec<_>>());
+            assert_eq!(
+                maps.iter().map(|map| &map.name).collect::<Vec<_>>(),
+                self.maps.iter().collect::<Vec<_>>()
+            );
+            assert_eq!(
+                listed(service, None).await,
+                self.model.0.values().cloned().collect::<Vec<_>>()
+            );
             let mut found = Vec::new();
             for map in maps {
                 let expected = self.model.of(&map.name);
@@ -220,15 +284,36 @@ impl History {
 
     /// All references of a map that pass the filter, nearest first; which ones, the model says.
     async fn search(&self, map: &MapName, filter: ReferenceFilter) -> Vec<(ReferenceId, f32)> {
-        let options = QueryOptions { top_k: Some(1000), rerank: Some(false), filter, ..Default::default() };
-        let request = QueryRequest { map: map.clone(), image: Bytes::from(picture(2)), options };
+        let options = QueryOptions {
+            top_k: Some(1000),
+            rerank: Some(false),
+            filter,
+            ..Default::default()
+        };
+        let request = QueryRequest {
+            map: map.clone(),
+            image: Bytes::from(picture(2)),
+            options,
+        };
         let answer = self.service().query(request).await.unwrap();
         let passes = |fields: &ReferenceFields| filter.accepts(fields.location, fields.captured_at);
-        let expected = self.model.of(map).into_iter().filter(|reference| passes(&reference.fields));
-        let mut references: Vec<Reference> = answer.results.iter().map(|result| result.reference.clone()).collect();
+        let expected = self
+            .model
+            .of(map)
+            .into_iter()
+            .filter(|reference| passes(&reference.fields));
+        let mut references: Vec<Reference> = answer
+            .results
+            .iter()
+            .map(|result| result.reference.clone())
+            .collect();
         references.sort_by_key(|reference| reference.id);
         assert_eq!(references, expected.collect::<Vec<_>>(), "{filter:?}");
-        answer.results.iter().map(|result| (result.reference.id, result.global_distance)).collect()
+        answer
+            .results
+            .iter()
+            .map(|result| (result.reference.id, result.global_distance))
+            .collect()
     }
 }
 
@@ -250,8 +335,14 @@ fn filters() -> [ReferenceFilter; 3] {
     let near = GeoCircle::new(place(3), 250.0).unwrap();
     [
         ReferenceFilter::default(),
-        ReferenceFilter { near: Some(near), ..Default::default() },
-        ReferenceFilter { captured_after: Some(minute(5)), ..Default::default() },
+        ReferenceFilter {
+            near: Some(near),
+            ..Default::default()
+        },
+        ReferenceFilter {
+            captured_after: Some(minute(5)),
+            ..Default::default()
+        },
     ]
 }
 
@@ -270,7 +361,14 @@ proptest! {
 // ---------------------------------------------------------------- many blocks
 
 fn open(directory: &std::path::Path) -> SqliteStore {
-    SqliteStore::open(directory, &StoreConfig { reserve_bytes: 1 << 20, ..StoreConfig::default() }).unwrap()
+    SqliteStore::open(
+        directory,
+        &StoreConfig {
+            reserve_bytes: 1 << 20,
+            ..StoreConfig::default()
+        },
+    )
+    .unwrap()
 }
 
 fn rebuild(store: &SqliteStore, map: &MapName) -> MapIndex {
@@ -279,7 +377,12 @@ fn rebuild(store: &SqliteStore, map: &MapName) -> MapIndex {
         store
             .scan_globals(map, &mut |row| {
                 let (id, global) = (row.reference, row.global);
-                entries.push(IndexEntry { id, global, location: row.location, captured_at: row.captured_at });
+                entries.push(IndexEntry {
+                    id,
+                    global,
+                    location: row.location,
+                    captured_at: row.captured_at,
+                });
             })
             .unwrap();
     }
@@ -306,7 +409,10 @@ fn assert_equal(a: &MapIndex, b: &MapIndex) {
     ];
     for (seed, filter) in (0..3).flat_map(|seed| filters.iter().map(move |filter| (seed, filter))) {
         let query = unit_vector(seed, GLOBAL_DIM);
-        assert_eq!(a.search(&query, a.len() + 1, filter), b.search(&query, a.len() + 1, filter));
+        assert_eq!(
+            a.search(&query, a.len() + 1, filter),
+            b.search(&query, a.len() + 1, filter)
+        );
     }
 }
 
@@ -323,7 +429,9 @@ fn rebuilt_equals_live_across_many_blocks() {
     let new: Vec<NewReference> = (0..9000).map(made).collect();
     let mut ids = Vec::new();
     for (outcome, new) in store.insert_many(new.clone()).into_iter().zip(&new) {
-        let Ok(Inserted::Created(created)) = outcome else { panic!("{outcome:?}") };
+        let Ok(Inserted::Created(created)) = outcome else {
+            panic!("{outcome:?}")
+        };
         live.insert(entry(&created, new));
         ids.push(created.id);
     }

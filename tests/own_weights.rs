@@ -1,7 +1,9 @@
-//! A server of one's own weights and head, as `train` writes them, and where its settings come from: the real binary.
+//! A server of one's own weights and head, as `train` writes them, and where its settings come
+//! from: the real binary.
 
 use placeformer::extract::{
-    Aggregate, BlockWeights, ExtractConfig, Extractor, Head, HeadChoice, Linear, Norm, Preset, VitWeights,
+    Aggregate, BlockWeights, ExtractConfig, Extractor, Head, HeadChoice, Linear, Norm, Preset,
+    VitWeights,
 };
 use placeformer::types::{GLOBAL_DIM, ImageSize};
 use rand::{RngExt, SeedableRng};
@@ -16,9 +18,19 @@ fn weights() -> VitWeights {
     let preset = Preset::PlaceformerVits16;
     let (geometry, mut random) = (preset.geometry(), ChaCha8Rng::seed_from_u64(7));
     let (dim, mlp, patch) = (geometry.dim, geometry.mlp_dim, geometry.patch);
-    let mut values = |count: usize| (0..count).map(|_| random.random_range(-0.05..0.05)).collect::<Vec<f32>>();
-    let norm = || Norm { weight: vec![1.0; dim], bias: vec![0.0; dim] };
-    let mut linear = |from: usize, to: usize| Linear { weight: values(from * to), bias: vec![0.0; to] };
+    let mut values = |count: usize| {
+        (0..count)
+            .map(|_| random.random_range(-0.05..0.05))
+            .collect::<Vec<f32>>()
+    };
+    let norm = || Norm {
+        weight: vec![1.0; dim],
+        bias: vec![0.0; dim],
+    };
+    let mut linear = |from: usize, to: usize| Linear {
+        weight: values(from * to),
+        bias: vec![0.0; to],
+    };
     let patch_embed = linear(3 * patch * patch, dim);
     let blocks = (0..geometry.depth)
         .map(|_| BlockWeights {
@@ -58,23 +70,42 @@ impl Own {
         let config = ExtractConfig {
             preset: Preset::PlaceformerVits16,
             // Small, so that an unoptimised build answers soon.
-            input_size: Some(ImageSize { width: 64, height: 48 }),
+            input_size: Some(ImageSize {
+                width: 64,
+                height: 48,
+            }),
             weights: Some(folder.path().join("weights.safetensors")),
             head: HeadChoice::None,
             ..Default::default()
         };
         weights().save(config.weights.as_ref().unwrap()).unwrap();
         let without_head = Extractor::open(&config).unwrap();
-        let weight = (0..GLOBAL_DIM * 384).map(|i| ((i * 37 % 101) as f32 - 50.0) / 100.0).collect();
+        let weight = (0..GLOBAL_DIM * 384)
+            .map(|i| ((i * 37 % 101) as f32 - 50.0) / 100.0)
+            .collect();
         let bias = vec![0.0; GLOBAL_DIM];
-        let head = Head::new(Aggregate::Mean, weight, bias, without_head.backbone(), Default::default()).unwrap();
+        let head = Head::new(
+            Aggregate::Mean,
+            weight,
+            bias,
+            without_head.backbone(),
+            Default::default(),
+        )
+        .unwrap();
         let head_path = folder.path().join("head.safetensors");
         head.save(&head_path).unwrap();
-        let with_head = Extractor::open(&ExtractConfig { head: HeadChoice::File(head_path), ..config }).unwrap();
+        let with_head = Extractor::open(&ExtractConfig {
+            head: HeadChoice::File(head_path),
+            ..config
+        })
+        .unwrap();
         let text = "[extract]\npreset = \"placeformer-vits16\"\ninput_size = { width = 64, height = 48 }\n\
                     [pipeline]\ndisk_reserve_bytes = 0\n[store]\nreserve_bytes = 1048576\n";
         std::fs::write(folder.path().join("placeformer.toml"), text).unwrap();
-        Self { model: with_head.model_id().to_string(), folder }
+        Self {
+            model: with_head.model_id().to_string(),
+            folder,
+        }
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -91,10 +122,15 @@ impl Own {
 /// The binary where nothing can be fetched and nothing is set but what a test sets.
 fn command(folder: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("PLACEFORMER_")) {
+    for (name, _) in
+        std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("PLACEFORMER_"))
+    {
         command.env_remove(name);
     }
-    command.args(arguments).env("PLACEFORMER_CACHE", folder.join("cache")).env("HF_ENDPOINT", "http://127.0.0.1:9");
+    command
+        .args(arguments)
+        .env("PLACEFORMER_CACHE", folder.join("cache"))
+        .env("HF_ENDPOINT", "http://127.0.0.1:9");
     command.current_dir(folder);
     command
 }
@@ -108,27 +144,56 @@ struct Server {
 
 impl Server {
     fn start(mut command: Command) -> Self {
-        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+        let mut child = command
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
         let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        let url = lines.find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
+        let url =
+            lines.find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
         // Fails only if one is installed already, which is as good.
         let _ = rustls::crypto::ring::default_provider().install_default();
-        let http = reqwest::blocking::Client::builder().timeout(Duration::from_secs(60)).build().unwrap();
-        let server = Self { child, url: url.expect("the server did not start"), http };
+        let http = reqwest::blocking::Client::builder()
+            .timeout(Duration::from_secs(60))
+            .build()
+            .unwrap();
+        let server = Self {
+            child,
+            url: url.expect("the server did not start"),
+            http,
+        };
         let began = Instant::now();
-        while server.http.get(format!("{}/readyz", server.url)).send().is_ok_and(|answer| answer.status() != 200) {
-            assert!(began.elapsed() < Duration::from_secs(120), "the server never became ready");
+        while server
+            .http
+            .get(format!("{}/readyz", server.url))
+            .send()
+            .is_ok_and(|answer| answer.status() != 200)
+        {
+            assert!(
+                began.elapsed() < Duration::from_secs(120),
+                "the server never became ready"
+            );
             std::thread::sleep(Duration::from_millis(20));
         }
         server
     }
 
     fn get(&self, path: &str) -> serde_json::Value {
-        self.http.get(format!("{}{path}", self.url)).send().unwrap().json().unwrap()
+        self.http
+            .get(format!("{}{path}", self.url))
+            .send()
+            .unwrap()
+            .json()
+            .unwrap()
     }
 
     fn post(&self, path: &str, body: Vec<u8>) -> (u16, serde_json::Value) {
-        let request = self.http.post(format!("{}{path}", self.url)).header("content-type", "image/png").body(body);
+        let request = self
+            .http
+            .post(format!("{}{path}", self.url))
+            .header("content-type", "image/png")
+            .body(body);
         let answer = request.send().unwrap();
         (answer.status().as_u16(), answer.json().unwrap())
     }
@@ -146,7 +211,9 @@ fn picture(seed: u64) -> Vec<u8> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let pixels = image::RgbImage::from_fn(64, 48, |_, _| image::Rgb(random.random()));
     let mut bytes = std::io::Cursor::new(Vec::new());
-    pixels.write_to(&mut bytes, image::ImageFormat::Png).unwrap();
+    pixels
+        .write_to(&mut bytes, image::ImageFormat::Png)
+        .unwrap();
     bytes.into_inner()
 }
 
@@ -158,27 +225,61 @@ fn weights_and_head_of_ones_own_are_served_and_imported_with() {
     for seed in 0..2 {
         std::fs::write(photos.join(format!("{seed}.png")), picture(seed)).unwrap();
     }
-    let flags = ["--weights", "weights.safetensors", "--head", "head.safetensors", "--precision", "f32"];
-    let import = [&["import", "photos", "--map", "m", "--data", "data"], &flags[..]].concat();
+    let flags = [
+        "--weights",
+        "weights.safetensors",
+        "--head",
+        "head.safetensors",
+        "--precision",
+        "f32",
+    ];
+    let import = [
+        &["import", "photos", "--map", "m", "--data", "data"],
+        &flags[..],
+    ]
+    .concat();
     let imported = own.command(&import).output().unwrap();
-    assert!(imported.status.success(), "{}", String::from_utf8_lossy(&imported.stderr));
+    assert!(
+        imported.status.success(),
+        "{}",
+        String::from_utf8_lossy(&imported.stderr)
+    );
     let serve = ["serve", "--listen", "127.0.0.1:0", "--data", "data"];
     let server = Server::start(own.command(&[&serve, &flags[..]].concat()));
     assert_eq!(server.get("/info")["model"], own.model.as_str());
-    assert_eq!(server.post("/references?map=m&external_id=new", picture(2)).0, 201);
+    assert_eq!(
+        server
+            .post("/references?map=m&external_id=new", picture(2))
+            .0,
+        201
+    );
     for (seed, name) in [(0, "0.png"), (1, "1.png"), (2, "new")] {
         let (status, answer) = server.post("/query?map=m&top_k=1", picture(seed));
-        assert_eq!((status, &answer["results"][0]["external_id"]), (200, &name.into()), "{answer}");
+        assert_eq!(
+            (status, &answer["results"][0]["external_id"]),
+            (200, &name.into()),
+            "{answer}"
+        );
     }
 }
 
 #[test]
 fn the_variable_that_other_commands_read_counts_for_the_server_too() {
     let own = Own::new();
-    let mut command =
-        own.command(&["serve", "--listen", "127.0.0.1:0", "--data", "data", "--head", "head.safetensors"]);
+    let mut command = own.command(&[
+        "serve",
+        "--listen",
+        "127.0.0.1:0",
+        "--data",
+        "data",
+        "--head",
+        "head.safetensors",
+    ]);
     command.env("PLACEFORMER_WEIGHTS", own.path("weights.safetensors"));
-    assert_eq!(Server::start(command).get("/info")["model"], own.model.as_str());
+    assert_eq!(
+        Server::start(command).get("/info")["model"],
+        own.model.as_str()
+    );
 }
 
 fn refusal(output: &Output) -> String {
@@ -192,20 +293,40 @@ fn a_server_that_could_not_search_does_not_start_and_says_what_to_set() {
     let serve = ["serve", "--listen", "127.0.0.1:0", "--data", "data"];
     for (flags, parts) in [
         (&["--head", "none"][..], &["extract.head", "head fit"][..]),
-        (&[], &["no weights are published", "--weights", "extract.weights"]),
-        (&["--weights", "weights.safetensors"], &["no head is built in", "--head", "extract.head"]),
-        (&["--weights", "missing.safetensors"], &["missing.safetensors"]),
+        (
+            &[],
+            &["no weights are published", "--weights", "extract.weights"],
+        ),
+        (
+            &["--weights", "weights.safetensors"],
+            &["no head is built in", "--head", "extract.head"],
+        ),
+        (
+            &["--weights", "missing.safetensors"],
+            &["missing.safetensors"],
+        ),
     ] {
         let error = refusal(&own.command(&[&serve, flags].concat()).output().unwrap());
-        assert!(parts.iter().all(|part| error.contains(part)), "{flags:?}: {error}");
+        assert!(
+            parts.iter().all(|part| error.contains(part)),
+            "{flags:?}: {error}"
+        );
     }
 }
 
 #[test]
 fn nothing_is_fetched_where_that_is_forbidden() {
     let folder = tempfile::tempdir().unwrap();
-    let error = refusal(&command(folder.path(), &["model", "pull"]).env("PLACEFORMER_OFFLINE", "1").output().unwrap());
-    assert!(error.contains("PLACEFORMER_OFFLINE") && !error.contains("Tried"), "{error}");
+    let error = refusal(
+        &command(folder.path(), &["model", "pull"])
+            .env("PLACEFORMER_OFFLINE", "1")
+            .output()
+            .unwrap(),
+    );
+    assert!(
+        error.contains("PLACEFORMER_OFFLINE") && !error.contains("Tried"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -213,22 +334,48 @@ fn flags_win_over_variables_and_variables_over_the_file() {
     let folder = tempfile::tempdir().unwrap();
     let text = "[http]\nmax_page = 11\nmax_connections = 12\n[log]\nfilter = \"warn\"\n";
     std::fs::write(folder.path().join("placeformer.toml"), text).unwrap();
-    let arguments = ["serve", "--print-config", "--config", "placeformer.toml", "--log", "error"];
+    let arguments = [
+        "serve",
+        "--print-config",
+        "--config",
+        "placeformer.toml",
+        "--log",
+        "error",
+    ];
     let mut printing = command(folder.path(), &arguments);
-    printing.env("PLACEFORMER_HTTP__MAX_CONNECTIONS", "13").env("PLACEFORMER_LOG__FILTER", "debug");
+    printing
+        .env("PLACEFORMER_HTTP__MAX_CONNECTIONS", "13")
+        .env("PLACEFORMER_LOG__FILTER", "debug");
     let output = printing.output().unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     let printed = String::from_utf8(output.stdout).unwrap();
     let table: toml::Table = printed.parse().unwrap();
     assert_eq!(table["http"]["max_page"].as_integer(), Some(11));
     assert_eq!(table["http"]["max_connections"].as_integer(), Some(13));
     assert_eq!(table["log"]["filter"].as_str(), Some("error"));
     // What is printed is explained, and is a configuration that prints the same.
-    assert!(printed.contains("# Most references in one page of a listing."), "{printed}");
+    assert!(
+        printed.contains("# Most references in one page of a listing."),
+        "{printed}"
+    );
     std::fs::write(folder.path().join("printed.toml"), &printed).unwrap();
-    let again = command(folder.path(), &["serve", "--print-config", "--config", "printed.toml"]).output().unwrap();
+    let again = command(
+        folder.path(),
+        &["serve", "--print-config", "--config", "printed.toml"],
+    )
+    .output()
+    .unwrap();
     assert_eq!(String::from_utf8(again.stdout).unwrap(), printed);
     let mut misspelt = command(folder.path(), &["serve", "--print-config"]);
-    let error = refusal(&misspelt.env("PLACEFORMER_HTTP_MAX_PAGE", "1").output().unwrap());
+    let error = refusal(
+        &misspelt
+            .env("PLACEFORMER_HTTP_MAX_PAGE", "1")
+            .output()
+            .unwrap(),
+    );
     assert!(error.contains("PLACEFORMER_HTTP__MAX_PAGE"), "{error}");
 }

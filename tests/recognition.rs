@@ -1,4 +1,5 @@
-//! From photos to places with the real model: a town is imported into a server and recognised again.
+//! From photos to places with the real model: a town is imported into a server and recognised
+//! again.
 
 #[path = "common/town.rs"]
 mod town;
@@ -22,22 +23,39 @@ struct Server {
 impl Server {
     #[track_caller]
     fn start(folder: &Path) -> Self {
-        let mut serve = command(folder, &["serve", "--listen", "127.0.0.1:0", "--data", "store"]);
+        let mut serve = command(
+            folder,
+            &["serve", "--listen", "127.0.0.1:0", "--data", "store"],
+        );
         serve.env("PLACEFORMER_EXTRACT__INPUT_SIZE", RECOGNISABLE_SIZE);
-        let mut child = serve.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+        let mut child = serve
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
         let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        let url = lines.find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
-        let server = Self { child, url: url.expect("the server did not start") };
+        let url =
+            lines.find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
+        let server = Self {
+            child,
+            url: url.expect("the server did not start"),
+        };
         let began = Instant::now();
         while !server.is_ready(folder) {
-            assert!(began.elapsed() < Duration::from_secs(120), "the server never became ready");
+            assert!(
+                began.elapsed() < Duration::from_secs(120),
+                "the server never became ready"
+            );
             std::thread::sleep(Duration::from_millis(100));
         }
         server
     }
 
     fn is_ready(&self, folder: &Path) -> bool {
-        placeformer(folder, &["healthcheck", "--server", &self.url]).status.success()
+        placeformer(folder, &["healthcheck", "--server", &self.url])
+            .status
+            .success()
     }
 }
 
@@ -52,7 +70,8 @@ impl Drop for Server {
 fn pairs(folder: &Path) -> Vec<(String, String)> {
     let text = std::fs::read_to_string(folder.join("town/ground_truth.csv")).unwrap();
     let rows = text.lines().skip(1).filter_map(|row| row.split_once(','));
-    rows.map(|(query, reference)| (query.to_owned(), reference.to_owned())).collect()
+    rows.map(|(query, reference)| (query.to_owned(), reference.to_owned()))
+        .collect()
 }
 
 #[test]
@@ -63,26 +82,48 @@ fn a_town_is_imported_and_recognised() {
     let town = tempfile::tempdir().unwrap();
     let folder = town.path();
     // A town that the built-in head has not seen.
-    let drawn = ["synth", "--out", "town", "--places", "8", "--views", "1", "--seed", "7", "--size", "320x240"];
+    let drawn = [
+        "synth", "--out", "town", "--places", "8", "--views", "1", "--seed", "7", "--size",
+        "320x240",
+    ];
     succeeds(folder, &drawn);
     let server = Server::start(folder);
     let target = ["--map", "town", "--server", &server.url];
-    succeeds(folder, &[&["import", "town/database"][..], &target].concat());
+    succeeds(
+        folder,
+        &[&["import", "town/database"][..], &target].concat(),
+    );
     let pairs = pairs(folder);
-    let mut queries: Vec<&str> =
-        pairs.iter().filter(|(_, reference)| !reference.is_empty()).map(|pair| pair.0.as_str()).collect();
+    let mut queries: Vec<&str> = pairs
+        .iter()
+        .filter(|(_, reference)| !reference.is_empty())
+        .map(|pair| pair.0.as_str())
+        .collect();
     queries.dedup();
     assert!(queries.len() >= 8, "{queries:?}");
     let first_is_right = |query: &&&str| {
         let photo = format!("town/queries/{query}");
-        let answer = succeeds(folder, &[&["query", &photo, "--json"][..], &target].concat());
+        let answer = succeeds(
+            folder,
+            &[&["query", &photo, "--json"][..], &target].concat(),
+        );
         let answer: Value = serde_json::from_str(&answer).unwrap();
-        assert_eq!((&answer["reranked"], &answer["results"][0]["rank"]), (&Value::Bool(true), &1.into()), "{answer}");
+        assert_eq!(
+            (&answer["reranked"], &answer["results"][0]["rank"]),
+            (&Value::Bool(true), &1.into()),
+            "{answer}"
+        );
         let name = answer["results"][0]["external_id"].as_str().unwrap();
-        pairs.iter().any(|(asked, reference)| asked == **query && reference == name)
+        pairs
+            .iter()
+            .any(|(asked, reference)| asked == **query && reference == name)
     };
     let right = queries.iter().filter(first_is_right).count();
-    assert!(2 * right > queries.len(), "{right} of {} queries are right", queries.len());
+    assert!(
+        2 * right > queries.len(),
+        "{right} of {} queries are right",
+        queries.len()
+    );
 }
 
 #[test]
@@ -91,9 +132,22 @@ fn the_demo_runs_to_its_report() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    let arguments = ["demo", "--places", "4", "--views", "1", "--pictures", "1", "--out", "shown"];
+    let arguments = [
+        "demo",
+        "--places",
+        "4",
+        "--views",
+        "1",
+        "--pictures",
+        "1",
+        "--out",
+        "shown",
+    ];
     let said = succeeds(folder.path(), &arguments);
     let page = std::fs::read_to_string(folder.path().join("shown/index.html")).unwrap();
-    assert!(page.contains("<html") && page.contains("data:image/") && said.contains("index.html"), "{said}");
+    assert!(
+        page.contains("<html") && page.contains("data:image/") && said.contains("index.html"),
+        "{said}"
+    );
     assert!(folder.path().join("shown/match-1.png").exists());
 }

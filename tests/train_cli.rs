@@ -11,7 +11,16 @@ use town::{SERVED_SIZE, SIZE, has_model, refusal, succeeds, town};
 
 fn train(more: &[&'static str]) -> Vec<&'static str> {
     let data = ["--dataset", "csv", "--root", "town", "--input-size", SIZE];
-    let run = ["--cache", "cache", "--steps", "20", "--mine-every", "5", "--batch", "4"];
+    let run = [
+        "--cache",
+        "cache",
+        "--steps",
+        "20",
+        "--mine-every",
+        "5",
+        "--batch",
+        "4",
+    ];
     [&["train"], &data[..], &run, more].concat()
 }
 
@@ -23,9 +32,21 @@ fn a_head_is_trained_continued_and_given_to_a_map() {
     let folder = town("8", "2");
     let folder = folder.path();
     // The margin is wide so that every triplet teaches something.
-    let command = train(&["--out", "run", "--learning-rate", "0.01", "--margin", "0.5", "--validation-share", "0.3"]);
+    let command = train(&[
+        "--out",
+        "run",
+        "--learning-rate",
+        "0.01",
+        "--margin",
+        "0.5",
+        "--validation-share",
+        "0.3",
+    ]);
     let first = succeeds(folder, &command);
-    assert!(first.contains("R@1") && first.contains("run/head.safetensors"), "{first}");
+    assert!(
+        first.contains("R@1") && first.contains("run/head.safetensors"),
+        "{first}"
+    );
     let log = std::fs::read_to_string(folder.join("run/train.jsonl")).unwrap();
     assert_eq!(log.lines().count(), 4, "{log}");
     let page = std::fs::read_to_string(folder.join("run/report.html")).unwrap();
@@ -34,52 +55,123 @@ fn a_head_is_trained_continued_and_given_to_a_map() {
     let head = || Head::load(&folder.join("run/head.safetensors")).unwrap();
     let before = head();
     assert_eq!((succeeds(folder, &command), head()), (first, before));
-    let other = train(&["--out", "run", "--learning-rate", "0.01", "--margin", "0.5", "--validation-share", "0.6"]);
+    let other = train(&[
+        "--out",
+        "run",
+        "--learning-rate",
+        "0.01",
+        "--margin",
+        "0.5",
+        "--validation-share",
+        "0.6",
+    ]);
     assert!(refusal(folder, &other).contains("other data"));
     give_to_a_map(folder);
 }
 
-/// Imports with the built-in head, then exchanges it for the trained one: the map is what a server with that head has.
+/// Imports with the built-in head, then exchanges it for the trained one: the map is what a server
+/// with that head has.
 fn give_to_a_map(folder: &Path) {
-    // Validation may not have improved, in which case the head kept is the first; this one differs for certain.
+    // Validation may not have improved, in which case the head kept is the first; this one differs
+    // for certain.
     let trained = Head::load(&folder.join("run/head.safetensors")).unwrap();
     let (weight, bias) = trained.weights();
-    let scaled: Vec<f32> = weight.iter().enumerate().map(|(i, w)| if i % 2 == 0 { w * 1.5 } else { *w }).collect();
-    let new = trained.with_weights(scaled.clone(), bias.to_vec(), trained.notes().clone()).unwrap();
+    let scaled: Vec<f32> = weight
+        .iter()
+        .enumerate()
+        .map(|(i, w)| if i % 2 == 0 { w * 1.5 } else { *w })
+        .collect();
+    let new = trained
+        .with_weights(scaled.clone(), bias.to_vec(), trained.notes().clone())
+        .unwrap();
     new.save(&folder.join("new.safetensors")).unwrap();
-    let import = ["import", "town/database", "--map", "town", "--data", "store"];
+    let import = [
+        "import",
+        "town/database",
+        "--map",
+        "town",
+        "--data",
+        "store",
+    ];
     succeeds(folder, &import);
     let model = |name: &str| {
         let store = SqliteStore::open(&folder.join("store"), &StoreConfig::default()).unwrap();
         let mut globals = Vec::new();
-        store.scan_globals(&name.parse().unwrap(), &mut |row| globals.push(row.global)).unwrap();
+        store
+            .scan_globals(&name.parse().unwrap(), &mut |row| globals.push(row.global))
+            .unwrap();
         (store.map(&name.parse().unwrap()).unwrap().model, globals)
     };
     let (before, old) = model("town");
-    let gem = Head::new(Aggregate::gem(3.0).unwrap(), scaled, bias.to_vec(), new.backbone(), [].into()).unwrap();
+    let gem = Head::new(
+        Aggregate::gem(3.0).unwrap(),
+        scaled,
+        bias.to_vec(),
+        new.backbone(),
+        [].into(),
+    )
+    .unwrap();
     gem.save(&folder.join("gem.safetensors")).unwrap();
     let rehead = |head| ["map", "rehead", "town", "--head", head, "--data", "store"];
     let refused = refusal(folder, &rehead("gem.safetensors"));
-    assert!(refused.contains("made by mean") && refused.contains("those of gem3"), "{refused}");
-    assert_eq!(model("town"), (before.clone(), old.clone()), "a refused head changes nothing");
+    assert!(
+        refused.contains("made by mean") && refused.contains("those of gem3"),
+        "{refused}"
+    );
+    assert_eq!(
+        model("town"),
+        (before.clone(), old.clone()),
+        "a refused head changes nothing"
+    );
     assert!(succeeds(folder, &rehead("new.safetensors")).contains("16 references"));
     let (after, projected) = model("town");
     assert_eq!(after, new.rebind(&before).unwrap());
     assert!(succeeds(folder, &rehead("new.safetensors")).contains("already"));
     // What extraction with the new head gives, but for the half precision of what the store kept.
     let mut fresh = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    fresh.args(["import", "town/database", "--map", "fresh", "--data", "store"]).current_dir(folder);
-    fresh.env("PLACEFORMER_EXTRACT__INPUT_SIZE", SERVED_SIZE).env("PLACEFORMER_EXTRACT__HEAD", "new.safetensors");
-    assert!(fresh.env_remove("PLACEFORMER_CONFIG").output().unwrap().status.success());
+    fresh
+        .args([
+            "import",
+            "town/database",
+            "--map",
+            "fresh",
+            "--data",
+            "store",
+        ])
+        .current_dir(folder);
+    fresh
+        .env("PLACEFORMER_EXTRACT__INPUT_SIZE", SERVED_SIZE)
+        .env("PLACEFORMER_EXTRACT__HEAD", "new.safetensors");
+    assert!(
+        fresh
+            .env_remove("PLACEFORMER_CONFIG")
+            .output()
+            .unwrap()
+            .status
+            .success()
+    );
     let (model_of_fresh, expected) = model("fresh");
     assert_eq!(model_of_fresh, after);
     // Four photos are imported at once, so the two maps differ in order.
     let nearest = |global: &Vec<f32>, others: &[Vec<f32>]| {
-        let distance = |other: &Vec<f32>| global.iter().zip(other).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
+        let distance = |other: &Vec<f32>| {
+            global
+                .iter()
+                .zip(other)
+                .map(|(a, b)| (a - b) * (a - b))
+                .sum::<f32>()
+        };
         others.iter().map(distance).fold(f32::INFINITY, f32::min)
     };
-    assert!(projected.iter().all(|global| nearest(global, &expected) < 1e-4));
-    assert!(old.iter().all(|global| nearest(global, &expected) > 1e-4), "the new head is another");
+    assert!(
+        projected
+            .iter()
+            .all(|global| nearest(global, &expected) < 1e-4)
+    );
+    assert!(
+        old.iter().all(|global| nearest(global, &expected) > 1e-4),
+        "the new head is another"
+    );
 }
 
 #[test]
@@ -93,9 +185,14 @@ fn the_last_block_is_trained_on_varied_images_of_drives() {
     let mut arguments: Vec<&str> = text.split_whitespace().collect();
     arguments.push(SIZE);
     let said = succeeds(folder.path(), &arguments);
-    let (weights, head) =
-        (folder.path().join("blocks/weights.safetensors"), folder.path().join("blocks/head.safetensors"));
-    assert!(said.contains("blocks/weights.safetensors") && weights.exists(), "{said}");
+    let (weights, head) = (
+        folder.path().join("blocks/weights.safetensors"),
+        folder.path().join("blocks/head.safetensors"),
+    );
+    assert!(
+        said.contains("blocks/weights.safetensors") && weights.exists(),
+        "{said}"
+    );
     // Bound to the weights beside it, whichever were kept.
     let weights = VitWeights::load(&weights, Preset::Dinov2Vits14, None).unwrap();
     let bound = format!("dinov2-vits14:{}:b8", &weights.content_hash()[..12]);
@@ -110,16 +207,102 @@ fn what_cannot_be_trained_is_refused_before_the_model_is_loaded() {
     for (arguments, part) in [
         (&["train", "--out", "x"][..], "--dataset"),
         (&["train", "--out", "x", "--dataset", "csv"], "--root"),
-        (&["train", "--out", "x", "--drives", "town/database", "--trainable", "last-0"], "last-N"),
-        (&["train", "--out", "x", "--drives", "town/database", "--viewpoint", "0.1"], "cached tokens"),
-        (&["train", "--out", "x", "--drives", "town/database", "--warm-up", "9000"], "warm-up"),
-        (&["train", "--out", "x", "--drives", "empty"], "holds no JPEG"),
-        (&["train", "--out", "x", "--drives", "town/database", "--validation-share", "2"], "between 0 and 1"),
-        (&["train", "--out", "x", "--drives", "town/database"], "nothing to learn from"),
-        (&["head", "train", "--out", "x", "--dataset", "csv", "--root", "town", "--positive-m", "30"], "no order"),
-        (&["head", "fit", "--images", "empty", "--out", "x"], "no images"),
-        (&["head", "fit", "--images", "town", "--out", "x", "--aggregate", "gem", "--gem-p", "0.5"], "from 1 to 64"),
-        (&["map", "rehead", "town", "--head", "absent", "--data", "town"], "absent"),
+        (
+            &[
+                "train",
+                "--out",
+                "x",
+                "--drives",
+                "town/database",
+                "--trainable",
+                "last-0",
+            ],
+            "last-N",
+        ),
+        (
+            &[
+                "train",
+                "--out",
+                "x",
+                "--drives",
+                "town/database",
+                "--viewpoint",
+                "0.1",
+            ],
+            "cached tokens",
+        ),
+        (
+            &[
+                "train",
+                "--out",
+                "x",
+                "--drives",
+                "town/database",
+                "--warm-up",
+                "9000",
+            ],
+            "warm-up",
+        ),
+        (
+            &["train", "--out", "x", "--drives", "empty"],
+            "holds no JPEG",
+        ),
+        (
+            &[
+                "train",
+                "--out",
+                "x",
+                "--drives",
+                "town/database",
+                "--validation-share",
+                "2",
+            ],
+            "between 0 and 1",
+        ),
+        (
+            &["train", "--out", "x", "--drives", "town/database"],
+            "nothing to learn from",
+        ),
+        (
+            &[
+                "head",
+                "train",
+                "--out",
+                "x",
+                "--dataset",
+                "csv",
+                "--root",
+                "town",
+                "--positive-m",
+                "30",
+            ],
+            "no order",
+        ),
+        (
+            &["head", "fit", "--images", "empty", "--out", "x"],
+            "no images",
+        ),
+        (
+            &[
+                "head",
+                "fit",
+                "--images",
+                "town",
+                "--out",
+                "x",
+                "--aggregate",
+                "gem",
+                "--gem-p",
+                "0.5",
+            ],
+            "from 1 to 64",
+        ),
+        (
+            &[
+                "map", "rehead", "town", "--head", "absent", "--data", "town",
+            ],
+            "absent",
+        ),
     ] {
         let error = refusal(folder, arguments);
         assert!(error.contains(part), "{arguments:?}: {error}");

@@ -1,6 +1,6 @@
-//! Image bytes: whatever arrives is an image within the limits or a typed error; never a panic, never more pixels
-//! than allowed. Decoders of others do panic; that this never leaves `decode` is what is tested, so a panic ends the run
-//! only where nothing contains it.
+//! Image bytes: whatever arrives is an image within the limits or a typed error; never a panic,
+//! never more pixels than allowed. Decoders of others do panic; that this never leaves `decode` is
+//! what is tested, so a panic ends the run only where nothing contains it.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;

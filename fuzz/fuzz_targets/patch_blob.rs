@@ -1,7 +1,7 @@
 //! Patch blobs: damaged bytes are refused; what is accepted is written back as the same bytes.
 //!
-//! A checksum turns nearly every mutation away at the door, so the second half of the rounds repairs it first: that
-//! lets the mutations reach the checks behind it.
+//! A checksum turns nearly every mutation away at the door, so the second half of the rounds
+//! repairs it first: that lets the mutations reach the checks behind it.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -23,6 +23,9 @@ fn check(bytes: &[u8]) {
         for row in 0..patches.len() {
             let _ = (patches.scale_of(row), patches.centre(row));
         }
-        assert_eq!(encode(&patches).expect("what was decoded can be encoded"), bytes);
+        assert_eq!(
+            encode(&patches).expect("what was decoded can be encoded"),
+            bytes
+        );
     }
 }

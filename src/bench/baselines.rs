@@ -10,24 +10,31 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-/// The normalised tensor of an image with nothing but the `image` crate: its decoder and its antialiased bilinear
-/// ("triangle") filter.
+/// The normalised tensor of an image with nothing but the `image` crate: its decoder and its
+/// antialiased bilinear ("triangle") filter.
 ///
 /// # Errors
 /// The decoder's.
-#[expect(clippy::disallowed_methods, reason = "the baseline is what the ban keeps out of the service")]
+#[expect(
+    clippy::disallowed_methods,
+    reason = "the baseline is what the ban keeps out of the service"
+)]
 pub fn load_tensor(bytes: &[u8], size: ImageSize) -> Result<Vec<f32>, image::ImageError> {
     let image = image::load_from_memory(bytes)?;
-    let small = image.resize_exact(size.width, size.height, FilterType::Triangle).to_rgb8();
+    let small = image
+        .resize_exact(size.width, size.height, FilterType::Triangle)
+        .to_rgb8();
     let plane = |channel: usize| {
-        let normalised =
-            move |pixel: &image::Rgb<u8>| (f32::from(pixel[channel]) / 255.0 - MEAN[channel]) / DEVIATION[channel];
+        let normalised = move |pixel: &image::Rgb<u8>| {
+            (f32::from(pixel[channel]) / 255.0 - MEAN[channel]) / DEVIATION[channel]
+        };
         small.pixels().map(normalised).collect::<Vec<_>>()
     };
     Ok((0..3).flat_map(plane).collect())
 }
 
-/// All distances in f32 on all threads, then a selection: squared distance and row of the `k` nearest, nearest first.
+/// All distances in f32 on all threads, then a selection: squared distance and row of the `k`
+/// nearest, nearest first.
 pub fn nearest(vectors: &[f32], query: &[f32], k: usize) -> Vec<(f32, u32)> {
     const ROWS: usize = 4096;
     let select = |mut all: Vec<(f32, u32)>| {
@@ -37,20 +44,31 @@ pub fn nearest(vectors: &[f32], query: &[f32], k: usize) -> Vec<(f32, u32)> {
         }
         all
     };
-    let parts = vectors.par_chunks(ROWS * GLOBAL_DIM).enumerate().map(|(number, chunk)| {
-        let distance = |row: &[f32]| {
-            let mut lanes = [0f32; 16];
-            for (row, query) in row.as_chunks::<16>().0.iter().zip(query.as_chunks::<16>().0) {
-                for lane in 0..16 {
-                    let difference = row[lane] - query[lane];
-                    lanes[lane] += difference * difference;
+    let parts = vectors
+        .par_chunks(ROWS * GLOBAL_DIM)
+        .enumerate()
+        .map(|(number, chunk)| {
+            let distance = |row: &[f32]| {
+                let mut lanes = [0f32; 16];
+                for (row, query) in row
+                    .as_chunks::<16>()
+                    .0
+                    .iter()
+                    .zip(query.as_chunks::<16>().0)
+                {
+                    for lane in 0..16 {
+                        let difference = row[lane] - query[lane];
+                        lanes[lane] += difference * difference;
+                    }
                 }
-            }
-            lanes.iter().sum::<f32>()
-        };
-        let rows = chunk.chunks_exact(GLOBAL_DIM).enumerate();
-        select(rows.map(|(row, vector)| (distance(vector), (number * ROWS + row) as u32)).collect())
-    });
+                lanes.iter().sum::<f32>()
+            };
+            let rows = chunk.chunks_exact(GLOBAL_DIM).enumerate();
+            select(
+                rows.map(|(row, vector)| (distance(vector), (number * ROWS + row) as u32))
+                    .collect(),
+            )
+        });
     let mut found = select(parts.reduce(Vec::new, |mut a, mut b| {
         a.append(&mut b);
         select(a)
@@ -59,8 +77,9 @@ pub fn nearest(vectors: &[f32], query: &[f32], k: usize) -> Vec<(f32, u32)> {
     found
 }
 
-/// Re-ranking with f32 descriptors: the whole similarity matrix by candle's GEMM, its maxima, and a plain RANSAC
-/// (random samples, 8x8 solve, adaptive stop at the same confidence and at most 2000 samples). Sum of all inliers.
+/// Re-ranking with f32 descriptors: the whole similarity matrix by candle's GEMM, its maxima, and a
+/// plain RANSAC (random samples, 8x8 solve, adaptive stop at the same confidence and at most 2000
+/// samples). Sum of all inliers.
 ///
 /// # Errors
 /// Candle's.
@@ -84,7 +103,11 @@ pub fn joined(patches: &KeyPatches, scales: ScaleSet) -> (Vec<f32>, Centres) {
     for scale in scales.scales() {
         let part = &patches.scales[scale - 1];
         descriptors.extend_from_slice(&part.descriptors);
-        centres.extend(part.index.iter().map(|&i| patches.grid.centre(scale, i as usize).map(f64::from)));
+        centres.extend(
+            part.index
+                .iter()
+                .map(|&i| patches.grid.centre(scale, i as usize).map(f64::from)),
+        );
     }
     (descriptors, centres)
 }
@@ -104,7 +127,9 @@ fn mutual_pairs(
     let forth = similarity.argmax(1)?.to_vec1::<u32>()?;
     let back = similarity.argmax(0)?.to_vec1::<u32>()?;
     let mutual = (0..n).filter(|&i| back[forth[i] as usize] == i as u32);
-    Ok(mutual.map(|i| (query_centres[i], reference_centres[forth[i] as usize])).collect())
+    Ok(mutual
+        .map(|i| (query_centres[i], reference_centres[forth[i] as usize]))
+        .collect())
 }
 
 /// Pixels within which a homography must place a patch.
@@ -122,13 +147,19 @@ fn ransac(points: &[PointPair]) -> usize {
     while drawn < needed {
         drawn += 1;
         let sample = rand::seq::index::sample(&mut rng, n, 4);
-        let Some(h) = solve(sample.iter().map(|i| points[i])) else { continue };
+        let Some(h) = solve(sample.iter().map(|i| points[i])) else {
+            continue;
+        };
         let count = points.iter().filter(|pair| agrees(&h, pair)).count();
         if count > best {
             best = count;
             let all = (best as f64 / n as f64).powi(4);
             let enough = ((1.0 - CONFIDENCE).ln() / (1.0 - all).ln()).ceil();
-            needed = needed.min(if enough.is_finite() { enough.max(0.0) as usize } else { MOST_SAMPLES });
+            needed = needed.min(if enough.is_finite() {
+                enough.max(0.0) as usize
+            } else {
+                MOST_SAMPLES
+            });
         }
     }
     best
@@ -141,7 +172,10 @@ fn solve(sample: impl Iterator<Item = PointPair>) -> Option<SVector<f64, 8>> {
             (2 * i, [x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y], u),
             (2 * i + 1, [0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y], v),
         ] {
-            values.into_iter().enumerate().for_each(|(column, value)| a[(row, column)] = value);
+            values
+                .into_iter()
+                .enumerate()
+                .for_each(|(column, value)| a[(row, column)] = value);
             b[row] = right;
         }
     }
@@ -150,7 +184,10 @@ fn solve(sample: impl Iterator<Item = PointPair>) -> Option<SVector<f64, 8>> {
 
 fn agrees(h: &SVector<f64, 8>, ([x, y], [u, v]): &PointPair) -> bool {
     let w = h[6] * x + h[7] * y + 1.0;
-    let (dx, dy) = ((h[0] * x + h[1] * y + h[2]) / w - u, (h[3] * x + h[4] * y + h[5]) / w - v);
+    let (dx, dy) = (
+        (h[0] * x + h[1] * y + h[2]) / w - u,
+        (h[3] * x + h[4] * y + h[5]) / w - v,
+    );
     w > 0.0 && dx * dx + dy * dy <= TOLERANCE * TOLERANCE
 }
 
@@ -164,9 +201,13 @@ mod tests {
         let vectors: Vec<f32> = (0..9000).flat_map(unit_vector).collect();
         let query = unit_vector(77_777);
         let found = nearest(&vectors, &query, 10);
-        let distance = |row: &[f32]| -> f32 { row.iter().zip(&query).map(|(a, b)| (a - b) * (a - b)).sum() };
-        let mut all: Vec<(f32, u32)> =
-            vectors.chunks_exact(GLOBAL_DIM).zip(0..).map(|(row, number)| (distance(row), number)).collect();
+        let distance =
+            |row: &[f32]| -> f32 { row.iter().zip(&query).map(|(a, b)| (a - b) * (a - b)).sum() };
+        let mut all: Vec<(f32, u32)> = vectors
+            .chunks_exact(GLOBAL_DIM)
+            .zip(0..)
+            .map(|(row, number)| (distance(row), number))
+            .collect();
         all.sort_by(|a, b| a.0.total_cmp(&b.0));
         let rows = |list: &[(f32, u32)]| list.iter().map(|found| found.1).collect::<Vec<_>>();
         assert_eq!(rows(&found), rows(&all[..10]));

@@ -8,7 +8,8 @@ use crate::image::{ImageConfig, load_tensor};
 use crate::pipeline::{IngestRequest, PipelineError, Service};
 use crate::store::{PlaceStore, SqliteStore, StoreConfig, StoreError};
 use crate::types::{
-    ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, NewReference, PackedPatches, ReferenceFields,
+    ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, NewReference, PackedPatches,
+    ReferenceFields,
 };
 use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt, stream};
@@ -27,31 +28,50 @@ const COMMITS: usize = 64;
 const WRITERS: usize = 16;
 
 impl Bench {
-    /// Milliseconds a photo until it is durable and can be found, as `import` sends them; the baseline takes one after
-    /// the other through the same stages. The limit is extraction alone: what overlaps it costs nothing.
+    /// Milliseconds a photo until it is durable and can be found, as `import` sends them; the
+    /// baseline takes one after the other through the same stages. The limit is extraction alone:
+    /// what overlaps it costs nothing.
     pub(super) fn ingest(&self) -> Result<Row, BenchError> {
         let photos = (0..PHOTOS)
             .map(|place| street(place, 2, REFERENCE_SIZE).map(Bytes::from))
             .collect::<Result<Vec<_>, _>>()?;
-        let runtime = tokio::runtime::Runtime::new().map_err(|error| BenchError::Setup(error.to_string()))?;
+        let runtime =
+            tokio::runtime::Runtime::new().map_err(|error| BenchError::Setup(error.to_string()))?;
         let store = SqliteStore::open(&self.new_folder("ingest")?, &StoreConfig::default())?;
         let service = self.service(store, 0)?;
-        let plain = SqliteStore::open(&self.new_folder("ingest-in-turn")?, &StoreConfig::default())?;
-        let tensors = photos.iter().map(|photo| self.tensor(photo)).collect::<Result<Vec<_>, _>>()?;
+        let plain =
+            SqliteStore::open(&self.new_folder("ingest-in-turn")?, &StoreConfig::default())?;
+        let tensors = photos
+            .iter()
+            .map(|photo| self.tensor(photo))
+            .collect::<Result<Vec<_>, _>>()?;
         let [ours, plain, extraction] = in_turn(
             self.rounds,
             [
                 &mut || Ok(runtime.block_on(take_in(&service, &photos))?),
                 &mut || self.one_by_one(&plain, &photos),
-                &mut || Ok(tensors.chunks(1).try_for_each(|one| self.extractor.extract(one).map(drop))?),
+                &mut || {
+                    Ok(tensors
+                        .chunks(1)
+                        .try_for_each(|one| self.extractor.extract(one).map(drop))?)
+                },
             ],
         )?
         .map(|ms| ms / PHOTOS as f64);
-        Row::new("ingest", "one photo after the other", (ours, plain), extraction)
+        Row::new(
+            "ingest",
+            "one photo after the other",
+            (ours, plain),
+            extraction,
+        )
     }
 
     pub(super) fn tensor(&self, photo: &[u8]) -> Result<ImageTensor, BenchError> {
-        Ok(load_tensor(photo, &ImageConfig::default(), self.spec.input_size)?)
+        Ok(load_tensor(
+            photo,
+            &ImageConfig::default(),
+            self.spec.input_size,
+        )?)
     }
 
     fn one_by_one(&self, store: &SqliteStore, photos: &[Bytes]) -> Result<(), BenchError> {
@@ -63,21 +83,35 @@ impl Bench {
         Ok(())
     }
 
-    /// Milliseconds a reference of writers that wait for their own commits but share syncs of the disk; the baseline
-    /// commits one after the other, with a sync each. The limit is one file of the same bytes, synced once.
+    /// Milliseconds a reference of writers that wait for their own commits but share syncs of the
+    /// disk; the baseline commits one after the other, with a sync each. The limit is one file of
+    /// the same bytes, synced once.
     pub(super) fn commit(&self) -> Result<Row, BenchError> {
         let folder = self.new_folder("commit")?;
         let open = |name| SqliteStore::open(&folder.join(name), &StoreConfig::default());
         let (shared, alone) = (open("shared")?, open("alone")?);
         let scene = RerankScene::new(0.4);
-        let news: Vec<NewReference> =
-            scene.candidates.iter().cycle().take(COMMITS).zip(0..).map(reference_of).collect();
-        let bytes = news.iter().map(|new| new.descriptor.patches.heap_bytes()).sum();
+        let news: Vec<NewReference> = scene
+            .candidates
+            .iter()
+            .cycle()
+            .take(COMMITS)
+            .zip(0..)
+            .map(reference_of)
+            .collect();
+        let bytes = news
+            .iter()
+            .map(|new| new.descriptor.patches.heap_bytes())
+            .sum();
         let [ours, plain, limit] = in_turn(
             self.rounds,
             [
                 &mut || Ok(insert_at_once(&shared, &news)?),
-                &mut || Ok(news.iter().try_for_each(|new| alone.insert(new.clone()).map(drop))?),
+                &mut || {
+                    Ok(news
+                        .iter()
+                        .try_for_each(|new| alone.insert(new.clone()).map(drop))?)
+                },
                 &mut || write_and_sync(&folder.join("plain"), bytes),
             ],
         )?
@@ -88,7 +122,13 @@ impl Bench {
 
 async fn take_in(service: &Arc<Service>, photos: &[Bytes]) -> Result<(), PipelineError> {
     let ingest = |image: Bytes| async move {
-        service.ingest(IngestRequest { map: street_map(), fields: ReferenceFields::default(), image }).await
+        service
+            .ingest(IngestRequest {
+                map: street_map(),
+                fields: ReferenceFields::default(),
+                image,
+            })
+            .await
     };
     stream::iter(photos.iter().cloned())
         .map(ingest)
@@ -98,28 +138,49 @@ async fn take_in(service: &Arc<Service>, photos: &[Bytes]) -> Result<(), Pipelin
 }
 
 fn insert_at_once(store: &SqliteStore, news: &[NewReference]) -> Result<(), StoreError> {
-    let write = |part: &[NewReference]| part.iter().try_for_each(|new| store.insert(new.clone()).map(drop));
+    let write = |part: &[NewReference]| {
+        part.iter()
+            .try_for_each(|new| store.insert(new.clone()).map(drop))
+    };
     std::thread::scope(|scope| {
-        let writers: Vec<_> = news.chunks(COMMITS / WRITERS).map(|part| scope.spawn(move || write(part))).collect();
-        writers.into_iter().try_for_each(|writer| writer.join().unwrap_or(Err(StoreError::Closing)))
+        let writers: Vec<_> = news
+            .chunks(COMMITS / WRITERS)
+            .map(|part| scope.spawn(move || write(part)))
+            .collect();
+        writers
+            .into_iter()
+            .try_for_each(|writer| writer.join().unwrap_or(Err(StoreError::Closing)))
     })
 }
 
 /// Writes and syncs a file of this length.
 pub(super) fn write_and_sync(path: &Path, bytes: usize) -> Result<(), BenchError> {
     let content = vec![7; bytes];
-    let written = File::create(path).and_then(|mut file| file.write_all(&content).and_then(|()| file.sync_all()));
-    written.map_err(|source| BenchError::Io { path: path.to_owned(), source })
+    let written = File::create(path)
+        .and_then(|mut file| file.write_all(&content).and_then(|()| file.sync_all()));
+    written.map_err(|source| BenchError::Io {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 fn reference_of((patches, number): (&KeyPatches, u64)) -> NewReference {
-    let descriptor =
-        Descriptor { global: unit_vector(number), pooled: vec![1.0, 0.0], patches: PackedPatches::quantise(patches) };
+    let descriptor = Descriptor {
+        global: unit_vector(number),
+        pooled: vec![1.0, 0.0],
+        patches: PackedPatches::quantise(patches),
+    };
     new_reference(ContentHash::of(&number.to_le_bytes()), descriptor)
 }
 
 /// A reference to be stored in [`street_map`].
 pub(super) fn new_reference(content_hash: ContentHash, descriptor: Descriptor) -> NewReference {
     let (map, model) = (street_map(), ModelId::new("scene"));
-    NewReference { map, fields: ReferenceFields::default(), content_hash, model, descriptor }
+    NewReference {
+        map,
+        fields: ReferenceFields::default(),
+        content_hash,
+        model,
+        descriptor,
+    }
 }

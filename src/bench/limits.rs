@@ -28,22 +28,37 @@ pub struct Limits {
 impl Limits {
     /// Measures for about two seconds.
     pub fn measure(simd: Simd) -> Self {
-        let giga = |per_thread: Vec<Option<f64>>| per_thread.into_iter().sum::<Option<f64>>().map(|sum| sum / 1e9);
+        let giga = |per_thread: Vec<Option<f64>>| {
+            per_thread
+                .into_iter()
+                .sum::<Option<f64>>()
+                .map(|sum| sum / 1e9)
+        };
         let all = |work: &(dyn Fn() -> Option<f64> + Sync)| giga(rayon::broadcast(|_| work()));
         Self {
-            f32_gflops: rayon::broadcast(|_| peak::f32_operations(simd, TIME)).into_iter().sum::<f64>() / 1e9,
+            f32_gflops: rayon::broadcast(|_| peak::f32_operations(simd, TIME))
+                .into_iter()
+                .sum::<f64>()
+                / 1e9,
             bf16_gflops: all(&|| peak::bf16_operations(simd, TIME)),
             int8_gops: all(&|| peak::int8_operations(simd, TIME)),
             read_gbytes: read_bandwidth() / 1e9,
         }
     }
 
-    /// What the layers and the attention of an encoder of this name and so many blocks can reach: its name tells its
-    /// precision (`fused-bf16-avx512`). Half of attention, the scores, is at int8 unless there are matrix registers, the
-    /// rest at bf16 where the CPU has it.
+    /// What the layers and the attention of an encoder of this name and so many blocks can reach:
+    /// its name tells its precision (`fused-bf16-avx512`). Half of attention, the scores, is at
+    /// int8 unless there are matrix registers, the rest at bf16 where the CPU has it.
     pub(super) fn encoder_giga_operations(&self, encoder: &str, blocks: usize) -> (f64, f64) {
-        let (bf16, int8) = (self.bf16_gflops.unwrap_or(self.f32_gflops), self.int8_gops.unwrap_or(self.f32_gflops));
-        let attention = if encoder.contains("amx") { bf16 } else { 2.0 / (1.0 / int8 + 1.0 / bf16) };
+        let (bf16, int8) = (
+            self.bf16_gflops.unwrap_or(self.f32_gflops),
+            self.int8_gops.unwrap_or(self.f32_gflops),
+        );
+        let attention = if encoder.contains("amx") {
+            bf16
+        } else {
+            2.0 / (1.0 / int8 + 1.0 / bf16)
+        };
         match () {
             () if encoder.contains("int8") => (int8, attention),
             () if encoder.contains("mixed") => {
@@ -71,7 +86,10 @@ fn read_bandwidth() -> f64 {
     let words: Vec<u64> = (0..BYTES as u64 / 8).collect();
     let pass = || {
         let started = Instant::now();
-        let sum: u64 = words.par_chunks(1 << 16).map(|part| part.iter().fold(0, |sum, word| sum ^ word)).sum();
+        let sum: u64 = words
+            .par_chunks(1 << 16)
+            .map(|part| part.iter().fold(0, |sum, word| sum ^ word))
+            .sum();
         black_box(sum);
         BYTES as f64 / started.elapsed().as_secs_f64()
     };

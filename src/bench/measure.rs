@@ -4,18 +4,25 @@ use std::convert::Infallible;
 use std::hint::black_box;
 use std::time::Instant;
 
-/// Medians in milliseconds of `ours` and `baseline`, run in turn `rounds` times after one unmeasured run of each.
-pub(super) fn paired<A, B>(rounds: usize, mut ours: impl FnMut() -> A, mut baseline: impl FnMut() -> B) -> (f64, f64) {
+/// Medians in milliseconds of `ours` and `baseline`, run in turn `rounds` times after one
+/// unmeasured run of each.
+pub(super) fn paired<A, B>(
+    rounds: usize,
+    mut ours: impl FnMut() -> A,
+    mut baseline: impl FnMut() -> B,
+) -> (f64, f64) {
     let run = |work: &mut dyn FnMut()| -> Result<(), Infallible> {
         work();
         Ok(())
     };
     let (mut ours, mut baseline) = (|| drop(black_box(ours())), || drop(black_box(baseline())));
-    let Ok([ours, baseline]) = in_turn(rounds, [&mut || run(&mut ours), &mut || run(&mut baseline)]);
+    let Ok([ours, baseline]) =
+        in_turn(rounds, [&mut || run(&mut ours), &mut || run(&mut baseline)]);
     (ours, baseline)
 }
 
-/// Medians in milliseconds of several works, run in turn `rounds` times after one unmeasured run of each.
+/// Medians in milliseconds of several works, run in turn `rounds` times after one unmeasured run of
+/// each.
 ///
 /// # Errors
 /// The first that a work fails with.
@@ -26,7 +33,8 @@ pub(super) fn in_turn<const N: usize, E>(
     works.iter_mut().try_for_each(|work| work())?;
     let mut times = [const { Vec::new() }; N];
     for round in 0..rounds {
-        // Who goes first changes, so that nobody always finds the caches as the same other left them.
+        // Who goes first changes, so that nobody always finds the caches as the same other left
+        // them.
         for place in 0..N {
             let number = (round + place) % N;
             let mut outcome = Ok(());

@@ -1,4 +1,5 @@
-//! Every stage measured beside what one would write first, in the same run, and as a share of the machine's limit.
+//! Every stage measured beside what one would write first, in the same run, and as a share of the
+//! machine's limit.
 //!
 //! | module | holds |
 //! |---|---|
@@ -40,20 +41,37 @@ pub struct Row {
     pub baseline_ms: f64,
     /// How many times faster ours is.
     pub ratio: f64,
-    /// The time that the machine's limit allows at best, divided by ours. Above 1 where memory is the limit and the
-    /// data fit a cache.
+    /// The time that the machine's limit allows at best, divided by ours. Above 1 where memory is
+    /// the limit and the data fit a cache.
     pub limit_share: f64,
 }
 
 impl Row {
     /// # Errors
     /// A figure is not a finite number, which a report could not hold.
-    fn new(name: &str, baseline: &str, (ours_ms, baseline_ms): (f64, f64), limit_ms: f64) -> Result<Self, BenchError> {
+    fn new(
+        name: &str,
+        baseline: &str,
+        (ours_ms, baseline_ms): (f64, f64),
+        limit_ms: f64,
+    ) -> Result<Self, BenchError> {
         let (ratio, limit_share) = (baseline_ms / ours_ms, limit_ms / ours_ms);
         if !(ratio.is_finite() && limit_share.is_finite()) {
-            return Err(BenchError::NotComparable { row: name.to_owned(), ours_ms, baseline_ms, limit_ms });
+            return Err(BenchError::NotComparable {
+                row: name.to_owned(),
+                ours_ms,
+                baseline_ms,
+                limit_ms,
+            });
         }
-        Ok(Self { name: name.to_owned(), ours_ms, baseline: baseline.to_owned(), baseline_ms, ratio, limit_share })
+        Ok(Self {
+            name: name.to_owned(),
+            ours_ms,
+            baseline: baseline.to_owned(),
+            baseline_ms,
+            ratio,
+            limit_share,
+        })
     }
 }
 
@@ -65,10 +83,16 @@ mod tests {
     fn every_figure_of_a_row_is_a_number() {
         let row = Row::new("a", "b", (2.0, 6.0), 1.0).unwrap();
         assert_eq!((row.ratio, row.limit_share), (3.0, 0.5));
-        for (times, limit) in
-            [((0.0, 1.0), 1.0), ((f64::NAN, 1.0), 1.0), ((1.0, f64::NAN), 1.0), ((1.0, 1.0), f64::NAN)]
-        {
-            assert!(matches!(Row::new("a", "b", times, limit), Err(BenchError::NotComparable { .. })));
+        for (times, limit) in [
+            ((0.0, 1.0), 1.0),
+            ((f64::NAN, 1.0), 1.0),
+            ((1.0, f64::NAN), 1.0),
+            ((1.0, 1.0), f64::NAN),
+        ] {
+            assert!(matches!(
+                Row::new("a", "b", times, limit),
+                Err(BenchError::NotComparable { .. })
+            ));
         }
     }
 }

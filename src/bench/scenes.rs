@@ -4,12 +4,14 @@ use crate::image::{ImageError, encode_jpeg};
 use crate::search::IndexEntry;
 use crate::synth::{Condition, StreetWorld, Viewpoint};
 use crate::types::{
-    GLOBAL_DIM, GeoPoint, ImageSize, KeyPatches, PatchGrid, PoolingStride, ReferenceId, ScaleKeyPatches,
+    GLOBAL_DIM, GeoPoint, ImageSize, KeyPatches, PatchGrid, PoolingStride, ReferenceId,
+    ScaleKeyPatches,
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// A full-HD JPEG of a drawn street: its entropy is that of a photo, and nothing needs to be shipped.
+/// A full-HD JPEG of a drawn street: its entropy is that of a photo, and nothing needs to be
+/// shipped.
 ///
 /// # Errors
 /// The encoder's.
@@ -18,19 +20,29 @@ pub fn photo() -> Result<Vec<u8>, ImageError> {
 }
 
 /// Size of the [`photo`].
-pub const PHOTO_SIZE: ImageSize = ImageSize { width: 1920, height: 1080 };
+pub const PHOTO_SIZE: ImageSize = ImageSize {
+    width: 1920,
+    height: 1080,
+};
 
 /// A JPEG of place `place`, seen as the `view`th time.
 ///
 /// # Errors
 /// The encoder's.
 pub fn street(place: u64, view: u64, size: ImageSize) -> Result<Vec<u8>, ImageError> {
-    let viewpoint = Viewpoint { along_m: view as f64 * 0.7, across_m: -1.5, turn_deg: 45.0 + view as f64 * 3.0 };
-    encode_jpeg(&StreetWorld::new(1).render(place, viewpoint, Condition::Day, size), 85)
+    let viewpoint = Viewpoint {
+        along_m: view as f64 * 0.7,
+        across_m: -1.5,
+        turn_deg: 45.0 + view as f64 * 3.0,
+    };
+    encode_jpeg(
+        &StreetWorld::new(1).render(place, viewpoint, Condition::Day, size),
+        85,
+    )
 }
 
-/// Approximately normal values, scaled to unit length: directions without preference, the hardest case for the search's
-/// bounds.
+/// Approximately normal values, scaled to unit length: directions without preference, the hardest
+/// case for the search's bounds.
 pub fn unit_vector(seed: u64) -> Vec<f32> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut normal = || (0..4).map(|_| random.random_range(-1f32..1.0)).sum::<f32>();
@@ -47,7 +59,12 @@ pub fn made_up_id(number: u64) -> ReferenceId {
 /// A made-up reference of an index, 11 cm north of the one before.
 pub fn index_entry(number: u64) -> IndexEntry {
     let location = GeoPoint::new(51.0 + number as f64 * 1e-6, 7.0).ok();
-    IndexEntry { id: made_up_id(number), global: unit_vector(number), location, captured_at: None }
+    IndexEntry {
+        id: made_up_id(number),
+        global: unit_vector(number),
+        location,
+        captured_at: None,
+    }
 }
 
 /// Candidates of a query.
@@ -56,7 +73,12 @@ pub const CANDIDATES: usize = 100;
 pub const CAPS: [usize; 3] = [400, 200, 50];
 /// Length of a patch descriptor.
 pub const DIM: usize = 384;
-const GRID: PatchGrid = PatchGrid { columns: 46, rows: 34, patch_px: 14, stride: PoolingStride::Kernel };
+const GRID: PatchGrid = PatchGrid {
+    columns: 46,
+    rows: 34,
+    patch_px: 14,
+    stride: PoolingStride::Kernel,
+};
 
 /// One query and its candidates in full precision.
 pub struct RerankScene {
@@ -70,8 +92,14 @@ impl RerankScene {
     /// Candidates in each of which `share` of the query's patches reappear under a homography.
     pub fn new(share: f64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(7);
-        let query = KeyPatches { grid: GRID, dim: DIM, scales: [1, 2, 3].map(|scale| random_scale(scale, &mut rng)) };
-        let candidates = (0..CANDIDATES).map(|_| candidate(&query, share, &mut rng)).collect();
+        let query = KeyPatches {
+            grid: GRID,
+            dim: DIM,
+            scales: [1, 2, 3].map(|scale| random_scale(scale, &mut rng)),
+        };
+        let candidates = (0..CANDIDATES)
+            .map(|_| candidate(&query, share, &mut rng))
+            .collect();
         Self { query, candidates }
     }
 }
@@ -89,13 +117,26 @@ fn normalised(values: impl Iterator<Item = f32>) -> Vec<f32> {
 
 fn random_scale(scale: usize, rng: &mut impl Rng) -> ScaleKeyPatches {
     let (columns, rows) = GRID.pooled(scale);
-    let index = (0..CAPS[scale - 1]).map(|_| rng.random_range(0..(columns * rows) as u32)).collect();
-    let descriptors =
-        (0..CAPS[scale - 1]).flat_map(|_| normalised((0..DIM).map(|_| gaussian(rng)).collect::<Vec<_>>().into_iter()));
-    ScaleKeyPatches { index, attention: vec![1.0; CAPS[scale - 1]], descriptors: descriptors.collect() }
+    let index = (0..CAPS[scale - 1])
+        .map(|_| rng.random_range(0..(columns * rows) as u32))
+        .collect();
+    let descriptors = (0..CAPS[scale - 1]).flat_map(|_| {
+        normalised(
+            (0..DIM)
+                .map(|_| gaussian(rng))
+                .collect::<Vec<_>>()
+                .into_iter(),
+        )
+    });
+    ScaleKeyPatches {
+        index,
+        attention: vec![1.0; CAPS[scale - 1]],
+        descriptors: descriptors.collect(),
+    }
 }
 
-/// A view of the query in which `share` of the patches reappear under a homography, snapped to the grid.
+/// A view of the query in which `share` of the patches reappear under a homography, snapped to the
+/// grid.
 fn candidate(query: &KeyPatches, share: f64, rng: &mut impl Rng) -> KeyPatches {
     let mut around = |middle: f64, spread: f64| middle + spread * (2.0 * rng.random::<f64>() - 1.0);
     let h = [
@@ -119,15 +160,25 @@ fn candidate(query: &KeyPatches, share: f64, rng: &mut impl Rng) -> KeyPatches {
             let w = h[6] * x + h[7] * y + h[8];
             let column = ((h[0] * x + h[1] * y + h[2]) / w / side).floor();
             let row = ((h[3] * x + h[4] * y + h[5]) / w / side).floor();
-            let inside = (0.0..columns as f64).contains(&column) && (0.0..rows as f64).contains(&row);
+            let inside =
+                (0.0..columns as f64).contains(&column) && (0.0..rows as f64).contains(&row);
             if rng.random::<f64>() < share && inside {
                 fresh.index[i] = row as u32 * columns as u32 + column as u32;
                 let old = &from.descriptors[i * DIM..][..DIM];
-                let near = normalised(old.iter().map(|v| v + 0.03 * gaussian(rng)).collect::<Vec<_>>().into_iter());
+                let near = normalised(
+                    old.iter()
+                        .map(|v| v + 0.03 * gaussian(rng))
+                        .collect::<Vec<_>>()
+                        .into_iter(),
+                );
                 fresh.descriptors[i * DIM..][..DIM].copy_from_slice(&near);
             }
         }
         fresh
     });
-    KeyPatches { grid: GRID, dim: DIM, scales }
+    KeyPatches {
+        grid: GRID,
+        dim: DIM,
+        scales,
+    }
 }

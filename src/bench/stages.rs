@@ -7,7 +7,8 @@ use super::measure::{median, paired};
 use super::scenes::{CANDIDATES, PHOTO_SIZE, RerankScene, index_entry, photo, street, unit_vector};
 use super::{Row, baselines};
 use crate::extract::{
-    CandleEncoder, Encoder, EncoderSpec, ExtractError, Extractor, Geometry, Precision, VitWeights, build_encoder,
+    CandleEncoder, Encoder, EncoderSpec, ExtractError, Extractor, Geometry, Precision, VitWeights,
+    build_encoder,
 };
 use crate::image::{ImageConfig, ImageError, load_tensor};
 use crate::kernels::scan::ROW_BYTES;
@@ -17,14 +18,16 @@ use crate::rerank::RerankConfig;
 use crate::search::{IndexEntry, MapIndex};
 use crate::store::{Inserted, PlaceStore, SqliteStore, StoreConfig, StoreError};
 use crate::types::{
-    ContentHash, ImageSize, ImageTensor, MapName, NewReference, ReferenceFields, ReferenceFilter, ReferenceId,
+    ContentHash, ImageSize, ImageTensor, MapName, NewReference, ReferenceFields, ReferenceFilter,
+    ReferenceId,
 };
 use bytes::Bytes;
 use rayon::prelude::*;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// The rows there are, in the order they are measured. `search_10m` takes 14 GB and runs only when it is named.
+/// The rows there are, in the order they are measured. `search_10m` takes 14 GB and runs only when
+/// it is named.
 pub const NAMES: [&str; 19] = [
     "decode_resize_1080p",
     "extract",
@@ -52,7 +55,10 @@ const NEAREST: usize = 100;
 /// References of the whole query.
 const QUERY_REFERENCES: u64 = 1_000_000;
 /// Size of drawn references.
-pub const REFERENCE_SIZE: ImageSize = ImageSize { width: 640, height: 480 };
+pub const REFERENCE_SIZE: ImageSize = ImageSize {
+    width: 640,
+    height: 480,
+};
 
 /// Why a row could not be measured.
 #[derive(Debug, thiserror::Error)]
@@ -73,7 +79,9 @@ pub enum BenchError {
         difference: String,
     },
     /// A quotient of two times that is not a number, such as where none passed.
-    #[error("{row}: {ours_ms} ms beside {baseline_ms} ms with a limit of {limit_ms} ms cannot be compared")]
+    #[error(
+        "{row}: {ours_ms} ms beside {baseline_ms} ms with a limit of {limit_ms} ms cannot be compared"
+    )]
     NotComparable {
         /// The row.
         row: String,
@@ -157,32 +165,51 @@ impl Bench {
             "commit" => self.commit(),
             "ingest" => self.ingest(),
             "rehead_100k" => self.rehead(),
-            other => Err(BenchError::UnknownRow { name: other.to_owned() }),
+            other => Err(BenchError::UnknownRow {
+                name: other.to_owned(),
+            }),
         }
     }
 
     fn decode(&self) -> Result<Row, BenchError> {
         let (bytes, size) = (photo()?, self.spec.input_size);
-        let (ours, plain) =
-            (load_tensor(&bytes, &ImageConfig::default(), size)?.data, baselines::load_tensor(&bytes, size)?);
-        let off = ours.iter().zip(&plain).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>() / ours.len() as f64;
-        agree("decode_resize_1080p", off < 0.03, || format!("pixels differ by {off} on average"))?;
+        let (ours, plain) = (
+            load_tensor(&bytes, &ImageConfig::default(), size)?.data,
+            baselines::load_tensor(&bytes, size)?,
+        );
+        let off = ours
+            .iter()
+            .zip(&plain)
+            .map(|(a, b)| f64::from((a - b).abs()))
+            .sum::<f64>()
+            / ours.len() as f64;
+        agree("decode_resize_1080p", off < 0.03, || {
+            format!("pixels differ by {off} on average")
+        })?;
         let times = paired(
             5 * self.rounds,
             || load_tensor(&bytes, &ImageConfig::default(), size),
             || baselines::load_tensor(&bytes, size),
         );
-        Row::new("decode_resize_1080p", "image crate", times, self.decode_limit_ms(bytes.len()))
+        Row::new(
+            "decode_resize_1080p",
+            "image crate",
+            times,
+            self.decode_limit_ms(bytes.len()),
+        )
     }
 
-    /// Milliseconds of memory traffic: the photo is read, its pixels written and read again, the tensor written.
+    /// Milliseconds of memory traffic: the photo is read, its pixels written and read again, the
+    /// tensor written.
     fn decode_limit_ms(&self, photo_bytes: usize) -> f64 {
         let pixels = |size: ImageSize| 3.0 * f64::from(size.width) * f64::from(size.height);
-        self.limits.memory_ms(photo_bytes as f64 + 2.0 * pixels(PHOTO_SIZE) + 4.0 * pixels(self.spec.input_size))
+        self.limits.memory_ms(
+            photo_bytes as f64 + 2.0 * pixels(PHOTO_SIZE) + 4.0 * pixels(self.spec.input_size),
+        )
     }
 
-    /// Milliseconds of reading what a scan reads of each reference. Memory is the limit of large maps; one that fits
-    /// the caches may beat it.
+    /// Milliseconds of reading what a scan reads of each reference. Memory is the limit of large
+    /// maps; one that fits the caches may beat it.
     fn search_limit_ms(&self, references: u64) -> f64 {
         self.limits.memory_ms(references as f64 * ROW_BYTES as f64)
     }
@@ -190,7 +217,9 @@ impl Bench {
     /// Milliseconds that an encoder of this name takes for one image at least.
     fn encode_limit_ms(&self, encoder: &str) -> f64 {
         let (layers, attention) = encoder_operations(&self.weights.geometry, &self.spec);
-        let (of_layers, of_attention) = self.limits.encoder_giga_operations(encoder, self.spec.blocks());
+        let (of_layers, of_attention) = self
+            .limits
+            .encoder_giga_operations(encoder, self.spec.blocks());
         Limits::milliseconds(layers, of_layers) + Limits::milliseconds(attention, of_attention)
     }
 
@@ -198,12 +227,24 @@ impl Bench {
         let ours = build_encoder(&self.weights, &self.spec, precision)?;
         let plain = CandleEncoder::new(&self.weights, &self.spec)?;
         let images = (0..batch as u64)
-            .map(|place| load_tensor(&street(place, 0, REFERENCE_SIZE)?, &ImageConfig::default(), self.spec.input_size))
+            .map(|place| {
+                load_tensor(
+                    &street(place, 0, REFERENCE_SIZE)?,
+                    &ImageConfig::default(),
+                    self.spec.input_size,
+                )
+            })
             .collect::<Result<Vec<ImageTensor>, _>>()?;
         let (a, b) = (ours.encode(&images[..1])?, plain.encode(&images[..1])?);
         let cosine = cosine(&a[0].tokens, &b[0].tokens, self.weights.geometry.dim);
-        agree("extract", cosine > 0.995, || format!("the tokens' cosine is {cosine}"))?;
-        let (ours_ms, plain_ms) = paired(self.rounds, || ours.encode(&images), || plain.encode(&images));
+        agree("extract", cosine > 0.995, || {
+            format!("the tokens' cosine is {cosine}")
+        })?;
+        let (ours_ms, plain_ms) = paired(
+            self.rounds,
+            || ours.encode(&images),
+            || plain.encode(&images),
+        );
         let times = (ours_ms / batch as f64, plain_ms / batch as f64);
         let limit = self.encode_limit_ms(&ours.name());
         let baseline = format!("candle f32 (ours: {})", ours.name());
@@ -211,53 +252,84 @@ impl Bench {
     }
 
     fn search(&self, name: &'static str, size: u64) -> Result<Row, BenchError> {
-        // The baseline's own copy of ten million vectors would not fit beside ours: it scans a tenth, ten times.
+        // The baseline's own copy of ten million vectors would not fit beside ours: it scans a
+        // tenth, ten times.
         let parts = size.div_ceil(1_000_000);
         let (index, vectors) = random_index(size, size / parts);
         let queries: Vec<Vec<f32>> = (0..32).map(|seed| unit_vector(u64::MAX - seed)).collect();
         let open = ReferenceFilter::default();
         if parts == 1 {
-            let ours: Vec<f32> = index.search(&queries[0], NEAREST, &open).iter().map(|n| n.distance).collect();
+            let ours: Vec<f32> = index
+                .search(&queries[0], NEAREST, &open)
+                .iter()
+                .map(|n| n.distance)
+                .collect();
             let plain = baselines::nearest(&vectors, &queries[0], NEAREST);
-            let same = ours.iter().zip(&plain).all(|(a, b)| (a - b.0.sqrt()).abs() < 1e-5);
+            let same = ours
+                .iter()
+                .zip(&plain)
+                .all(|(a, b)| (a - b.0.sqrt()).abs() < 1e-5);
             agree(name, same, || "the distances differ".into())?;
         }
         let (mut ours_turn, mut plain_turn) = (queries.iter().cycle(), queries.iter().cycle());
         let mut next = || ours_turn.next().map_or(&[][..], Vec::as_slice);
         let mut next_plain = || plain_turn.next().map_or(&[][..], Vec::as_slice);
-        let rounds = if size > 100_000 { 3 * self.rounds } else { 20 * self.rounds };
+        let rounds = if size > 100_000 {
+            3 * self.rounds
+        } else {
+            20 * self.rounds
+        };
         let times = paired(
             rounds,
             || index.search(next(), NEAREST, &open),
             || {
                 let query = next_plain();
-                (0..parts).map(|_| baselines::nearest(&vectors, query, NEAREST).len()).sum::<usize>()
+                (0..parts)
+                    .map(|_| baselines::nearest(&vectors, query, NEAREST).len())
+                    .sum::<usize>()
             },
         );
         Row::new(name, "f32 scan", times, self.search_limit_ms(size))
     }
 
-    /// A photo through the whole service at a million references, against the sum of the plain stages.
+    /// A photo through the whole service at a million references, against the sum of the plain
+    /// stages.
     fn query(&self) -> Result<Row, BenchError> {
         let setup = |error: &dyn std::fmt::Display| BenchError::Setup(error.to_string());
         let runtime = tokio::runtime::Runtime::new().map_err(|error| setup(&error))?;
         let (store, ids) = self.store_of_streets()?;
         let photo = Bytes::from(photo()?);
-        // What the service will compare the photo with: random vectors are far from it, so that the streets are nearest.
+        // What the service will compare the photo with: random vectors are far from it, so that the
+        // streets are nearest.
         let scene = self.scene_of(&photo, &store, &ids)?;
         let service = self.service(store, QUERY_REFERENCES - ids.len() as u64)?;
         let map: MapName = street_map();
         let ours = || {
-            let request = QueryRequest { map: map.clone(), image: photo.clone(), options: QueryOptions::default() };
+            let request = QueryRequest {
+                map: map.clone(),
+                image: photo.clone(),
+                options: QueryOptions::default(),
+            };
             runtime.block_on(service.query(request))
         };
         let answer = ours()?;
-        agree("query_1m", answer.reranked, || "the answer was not re-ranked".into())?;
-        let vectors: Vec<f32> = (0..QUERY_REFERENCES).into_par_iter().flat_map_iter(unit_vector).collect();
-        let (plain, query) = (CandleEncoder::new(&self.weights, &self.spec)?, unit_vector(1));
+        agree("query_1m", answer.reranked, || {
+            "the answer was not re-ranked".into()
+        })?;
+        let vectors: Vec<f32> = (0..QUERY_REFERENCES)
+            .into_par_iter()
+            .flat_map_iter(unit_vector)
+            .collect();
+        let (plain, query) = (
+            CandleEncoder::new(&self.weights, &self.spec)?,
+            unit_vector(1),
+        );
         let baseline = || -> Result<usize, BenchError> {
             let data = baselines::load_tensor(&photo, self.spec.input_size)?;
-            let encoded = plain.encode(&[ImageTensor { size: self.spec.input_size, data }])?;
+            let encoded = plain.encode(&[ImageTensor {
+                size: self.spec.input_size,
+                data,
+            }])?;
             let found = baselines::nearest(&vectors, &query, NEAREST);
             Ok(encoded.len() + found.len() + baselines::rerank(&scene)?)
         };
@@ -271,20 +343,34 @@ impl Bench {
     }
 
     /// The photo's key patches and those of the references it is compared with, in full precision.
-    fn scene_of(&self, photo: &[u8], store: &SqliteStore, ids: &[ReferenceId]) -> Result<RerankScene, BenchError> {
+    fn scene_of(
+        &self,
+        photo: &[u8],
+        store: &SqliteStore,
+        ids: &[ReferenceId],
+    ) -> Result<RerankScene, BenchError> {
         let tensor = load_tensor(photo, &ImageConfig::default(), self.spec.input_size)?;
         let described = self.extractor.extract_full(&[tensor])?;
         let query = described.into_iter().map(|(_, patches)| patches).next();
-        let query = query.ok_or_else(|| BenchError::Setup("one image gave no descriptor".into()))?;
-        let candidates: Result<Vec<_>, StoreError> =
-            ids.iter().map(|id| store.patches(*id).map(|patches| dequantised(&patches))).collect();
-        Ok(RerankScene { query, candidates: candidates? })
+        let query =
+            query.ok_or_else(|| BenchError::Setup("one image gave no descriptor".into()))?;
+        let candidates: Result<Vec<_>, StoreError> = ids
+            .iter()
+            .map(|id| store.patches(*id).map(|patches| dequantised(&patches)))
+            .collect();
+        Ok(RerankScene {
+            query,
+            candidates: candidates?,
+        })
     }
 
     /// A folder of this name without anything in it.
     pub(super) fn new_folder(&self, name: &str) -> Result<PathBuf, BenchError> {
         let path = self.folder.join(name);
-        let failed = |source| BenchError::Io { path: path.clone(), source };
+        let failed = |source| BenchError::Io {
+            path: path.clone(),
+            source,
+        };
         if path.exists() {
             std::fs::remove_dir_all(&path).map_err(failed)?;
         }
@@ -293,14 +379,21 @@ impl Bench {
     }
 
     /// A service over `store` with `extra` made-up references in each map.
-    pub(super) fn service(&self, store: SqliteStore, extra: u64) -> Result<Arc<Service>, BenchError> {
+    pub(super) fn service(
+        &self,
+        store: SqliteStore,
+        extra: u64,
+    ) -> Result<Arc<Service>, BenchError> {
         let metrics = Metrics::new().map_err(|error| BenchError::Setup(error.to_string()))?;
         Ok(Service::start(Parts {
             store: Arc::new(FilledStore::new(store, extra)?),
             source: self.extractor.clone(),
             image: ImageConfig::default(),
             rerank: RerankConfig::default(),
-            pipeline: PipelineConfig { deadline_ms: 600_000, ..PipelineConfig::default() },
+            pipeline: PipelineConfig {
+                deadline_ms: 600_000,
+                ..PipelineConfig::default()
+            },
             metrics: Arc::new(metrics),
             health: Arc::new(Health::default()),
         })?)
@@ -311,21 +404,33 @@ impl Bench {
         let store = SqliteStore::open(&self.folder.join("store"), &StoreConfig::default())?;
         fill_with_streets(&store, &self.extractor, CANDIDATES as u64)?;
         let page = store.list(Some(&street_map()), None, CANDIDATES)?;
-        Ok((store, page.references.into_iter().map(|reference| reference.id).collect()))
+        Ok((
+            store,
+            page.references
+                .into_iter()
+                .map(|reference| reference.id)
+                .collect(),
+        ))
     }
 }
 
 /// The map that [`fill_with_streets`] fills.
 pub fn street_map() -> MapName {
     // Proven by the name itself, which is within the allowed letters.
-    "streets".parse().unwrap_or_else(|_| unreachable!("a constant name of letters"))
+    "streets"
+        .parse()
+        .unwrap_or_else(|_| unreachable!("a constant name of letters"))
 }
 
 /// Brings the map of drawn streets in `store` up to `count` references.
 ///
 /// # Errors
 /// Drawing, extraction or storing fails.
-pub fn fill_with_streets(store: &SqliteStore, extractor: &Extractor, count: u64) -> Result<(), BenchError> {
+pub fn fill_with_streets(
+    store: &SqliteStore,
+    extractor: &Extractor,
+    count: u64,
+) -> Result<(), BenchError> {
     const BATCH: u64 = 8;
     let map = street_map();
     let there = match store.maps()?.into_iter().find(|info| info.name == map) {
@@ -343,38 +448,68 @@ pub fn fill_with_streets(store: &SqliteStore, extractor: &Extractor, count: u64)
             .iter()
             .map(|bytes| load_tensor(bytes, &ImageConfig::default(), extractor.input_size()))
             .collect::<Result<Vec<_>, _>>()?;
-        let new = extractor.extract(&images)?.into_iter().zip(&photos).map(|(descriptor, bytes)| NewReference {
-            map: map.clone(),
-            fields: ReferenceFields::default(),
-            content_hash: ContentHash::of(bytes),
-            model: extractor.model_id().clone(),
-            descriptor,
-        });
-        store.insert_many(new.collect()).into_iter().try_for_each(|stored| stored.map(|_: Inserted| ()))?;
+        let new =
+            extractor
+                .extract(&images)?
+                .into_iter()
+                .zip(&photos)
+                .map(|(descriptor, bytes)| NewReference {
+                    map: map.clone(),
+                    fields: ReferenceFields::default(),
+                    content_hash: ContentHash::of(bytes),
+                    model: extractor.model_id().clone(),
+                    descriptor,
+                });
+        store
+            .insert_many(new.collect())
+            .into_iter()
+            .try_for_each(|stored| stored.map(|_: Inserted| ()))?;
     }
     Ok(())
 }
 
-pub(super) fn agree(row: &'static str, yes: bool, difference: impl FnOnce() -> String) -> Result<(), BenchError> {
-    if yes { Ok(()) } else { Err(BenchError::Disagree { row, difference: difference() }) }
+pub(super) fn agree(
+    row: &'static str,
+    yes: bool,
+    difference: impl FnOnce() -> String,
+) -> Result<(), BenchError> {
+    if yes {
+        Ok(())
+    } else {
+        Err(BenchError::Disagree {
+            row,
+            difference: difference(),
+        })
+    }
 }
 
 /// Median cosine of corresponding rows.
 fn cosine(a: &[f32], b: &[f32], dim: usize) -> f64 {
-    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
+    let dot = |a: &[f32], b: &[f32]| {
+        a.iter()
+            .zip(b)
+            .map(|(a, b)| f64::from(*a) * f64::from(*b))
+            .sum::<f64>()
+    };
     let rows = a.chunks_exact(dim).zip(b.chunks_exact(dim));
-    median(rows.map(|(a, b)| dot(a, b) / (dot(a, a) * dot(b, b)).sqrt()).collect())
+    median(
+        rows.map(|(a, b)| dot(a, b) / (dot(a, a) * dot(b, b)).sqrt())
+            .collect(),
+    )
 }
 
 /// An index of `size` random references, and the first `copied` vectors once more.
 fn random_index(size: u64, copied: u64) -> (MapIndex, Vec<f32>) {
     let entries: Vec<IndexEntry> = (0..size).into_par_iter().map(index_entry).collect();
-    let vectors = entries[..copied as usize].iter().flat_map(|entry| entry.global.iter().copied()).collect();
+    let vectors = entries[..copied as usize]
+        .iter()
+        .flat_map(|entry| entry.global.iter().copied())
+        .collect();
     (MapIndex::build(entries), vectors)
 }
 
-/// Multiply-adds of the transformer up to its last block, each counted as two operations: of its linear layers, and of
-/// attention.
+/// Multiply-adds of the transformer up to its last block, each counted as two operations: of its
+/// linear layers, and of attention.
 fn encoder_operations(geometry: &Geometry, spec: &EncoderSpec) -> (f64, f64) {
     let (columns, rows) = geometry.grid(spec.input_size);
     let (dim, patches) = (geometry.dim as f64, (columns * rows) as f64);
@@ -395,13 +530,20 @@ mod tests {
     fn operations_are_those_of_the_published_model() {
         let preset = Preset::Dinov2Vits14;
         let whole = EncoderSpec {
-            input_size: ImageSize { width: 224, height: 224 },
+            input_size: ImageSize {
+                width: 224,
+                height: 224,
+            },
             exit_block: 11,
             token_norm: true,
             attention_block: 11,
         };
-        // 257 tokens, 12 blocks: 11.0 GFLOP of linear layers, 1.2 of attention, 0.1 of the embedding.
+        // 257 tokens, 12 blocks: 11.0 GFLOP of linear layers, 1.2 of attention, 0.1 of the
+        // embedding.
         let (layers, attention) = encoder_operations(&preset.geometry(), &whole);
-        assert!((10.9e9..11.3e9).contains(&layers) && (1.1e9..1.3e9).contains(&attention), "{layers} {attention}");
+        assert!(
+            (10.9e9..11.3e9).contains(&layers) && (1.1e9..1.3e9).contains(&attention),
+            "{layers} {attention}"
+        );
     }
 }

@@ -12,8 +12,8 @@ pub struct BackupArgs {
     /// Directory of the store; a server may be running on it.
     #[arg(long, value_name = "DIR")]
     data: PathBuf,
-    /// Data directory to make of the copy; it must not hold a store yet. `verify --data`, `map rehead --data` and
-    /// `serve --data` take it as it is.
+    /// Data directory to make of the copy; it must not hold a store yet. `verify --data`, `map
+    /// rehead --data` and `serve --data` take it as it is.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Settings of the store, as the server reads them (TOML).
@@ -24,8 +24,13 @@ pub struct BackupArgs {
 /// Runs it.
 pub fn run(args: BackupArgs) -> anyhow::Result<()> {
     let config = Config::load(args.config.as_deref(), &Overrides::default())?;
-    ensure!(args.data.is_dir(), "there is no store in {}", args.data.display());
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    ensure!(
+        args.data.is_dir(),
+        "there is no store in {}",
+        args.data.display()
+    );
+    std::fs::create_dir_all(&args.out)
+        .with_context(|| format!("cannot create {}", args.out.display()))?;
     let target = args.out.join(SqliteStore::DATABASE);
     let bytes = SqliteStore::backup_of(&args.data, &config.store, &target)
         .with_context(|| format!("cannot back up {}", args.data.display()))?;

@@ -9,7 +9,8 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Longest wait for readiness: loading a model takes seconds, building the index of millions a minute.
+/// Longest wait for readiness: loading a model takes seconds, building the index of millions a
+/// minute.
 const START_LIMIT: Duration = Duration::from_secs(300);
 /// Longest wait for a drain.
 const STOP_LIMIT: Duration = Duration::from_secs(30);
@@ -22,10 +23,14 @@ pub(super) struct ChildServer {
 }
 
 impl ChildServer {
-    /// Runs this program with arguments that make it serve on a free loopback port, and waits until it is ready. What it
-    /// says goes to `log`.
-    pub(super) fn start(arguments: impl IntoIterator<Item = OsString>, log: PathBuf) -> anyhow::Result<Self> {
-        let log_file = File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
+    /// Runs this program with arguments that make it serve on a free loopback port, and waits until
+    /// it is ready. What it says goes to `log`.
+    pub(super) fn start(
+        arguments: impl IntoIterator<Item = OsString>,
+        log: PathBuf,
+    ) -> anyhow::Result<Self> {
+        let log_file =
+            File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
         let program = std::env::current_exe().context("cannot find this program's own file")?;
         let mut child = Command::new(program)
             .args(arguments)
@@ -38,9 +43,17 @@ impl ChildServer {
         if let Some(stdout) = child.stdout.take() {
             BufReader::new(stdout).read_line(&mut first_line)?;
         }
-        let url = first_line.trim().strip_prefix("listening on ").unwrap_or_default().to_owned();
+        let url = first_line
+            .trim()
+            .strip_prefix("listening on ")
+            .unwrap_or_default()
+            .to_owned();
         let server = Self { child, url, log };
-        ensure!(!server.url.is_empty(), "the server did not start; see {}", server.log.display());
+        ensure!(
+            !server.url.is_empty(),
+            "the server did not start; see {}",
+            server.log.display()
+        );
         server.wait_until_ready()
     }
 
@@ -51,27 +64,47 @@ impl ChildServer {
 
     fn wait_until_ready(mut self) -> anyhow::Result<Self> {
         let started = Instant::now();
-        let client = ServerClient::new(ServerArgs { server: self.url.clone(), api_key: None, timeout: 10 })?;
+        let client = ServerClient::new(ServerArgs {
+            server: self.url.clone(),
+            api_key: None,
+            timeout: 10,
+        })?;
         while started.elapsed() < START_LIMIT {
             if let Some(status) = self.child.try_wait()? {
                 bail!("the server ended with {status}; see {}", self.log.display());
             }
-            if client.probe("/readyz").is_ok_and(|(status, _)| status == 200) {
+            if client
+                .probe("/readyz")
+                .is_ok_and(|(status, _)| status == 200)
+            {
                 return Ok(self);
             }
             std::thread::sleep(Duration::from_millis(50));
         }
-        bail!("the server was not ready within {} s; see {}", START_LIMIT.as_secs(), self.log.display())
+        bail!(
+            "the server was not ready within {} s; see {}",
+            START_LIMIT.as_secs(),
+            self.log.display()
+        )
     }
 
     /// Asks it to stop, as a supervisor would, and waits for the drain.
     pub(super) fn stop(mut self) -> anyhow::Result<()> {
-        let asked = Command::new("kill").args(["-TERM", &self.child.id().to_string()]).status();
-        ensure!(asked.is_ok_and(|status| status.success()), "the server could not be asked to stop");
+        let asked = Command::new("kill")
+            .args(["-TERM", &self.child.id().to_string()])
+            .status();
+        ensure!(
+            asked.is_ok_and(|status| status.success()),
+            "the server could not be asked to stop"
+        );
         let started = Instant::now();
         while started.elapsed() < STOP_LIMIT {
             if let Some(status) = self.child.try_wait()? {
-                ensure!(status.success(), "the server stopped with {status}; see {}", self.log.display());
+                ensure!(
+                    status.success(),
+                    "the server stopped with {status}; see {}",
+                    self.log.display()
+                );
                 return Ok(());
             }
             std::thread::sleep(Duration::from_millis(20));
@@ -82,7 +115,8 @@ impl ChildServer {
 
 impl Drop for ChildServer {
     fn drop(&mut self) {
-        // Already stopped in the good case; then there is nothing to kill and the error says only that.
+        // Already stopped in the good case; then there is nothing to kill and the error says only
+        // that.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

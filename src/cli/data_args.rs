@@ -5,8 +5,8 @@ use crate::eval::datasets::{DatasetOptions, Split};
 /// What is taken of a data set in the layout in which it is distributed.
 #[derive(Debug, Clone, clap::Args)]
 pub struct ReadArgs {
-    /// Part of the data set [default: train for training; for evaluation test, val for MSLS, train for RobotCar, whose
-    /// test poses are withheld].
+    /// Part of the data set [default: train for training; for evaluation test, val for MSLS, train
+    /// for RobotCar, whose test poses are withheld].
     #[arg(long, value_enum)]
     pub split: Option<Split>,
     /// Only these cities (MSLS).

@@ -58,7 +58,11 @@ fn as_json(trace: &ExtractionTrace, extractor: &Extractor) -> Value {
     })
 }
 
-fn write_safetensors(path: &Path, trace: &ExtractionTrace, extractor: &Extractor) -> anyhow::Result<()> {
+fn write_safetensors(
+    path: &Path,
+    trace: &ExtractionTrace,
+    extractor: &Extractor,
+) -> anyhow::Result<()> {
     let arrays = trace.arrays();
     let views: Result<Vec<_>, _> = arrays
         .iter()
@@ -71,18 +75,27 @@ fn write_safetensors(path: &Path, trace: &ExtractionTrace, extractor: &Extractor
         })
         .collect();
     let metadata = [("model".to_owned(), extractor.model_id().to_string())].into();
-    safetensors::serialize_to_file(views?, Some(metadata), path).with_context(|| path.display().to_string())
+    safetensors::serialize_to_file(views?, Some(metadata), path)
+        .with_context(|| path.display().to_string())
 }
 
 fn print_summary(trace: &ExtractionTrace, extractor: &Extractor) -> Result<(), OutputError> {
     say!("model {}", extractor.model_id())?;
     for array in trace.arrays() {
-        let shape = array.shape.iter().map(usize::to_string).collect::<Vec<_>>().join("x");
+        let shape = array
+            .shape
+            .iter()
+            .map(usize::to_string)
+            .collect::<Vec<_>>()
+            .join("x");
         let (low, high, mean) = match &array.values {
             TraceValues::F32(values) => range(values.iter().map(|&v| v as f64)),
             TraceValues::I64(values) => range(values.iter().map(|&v| v as f64)),
         };
-        say!("{:32} {shape:>12}  min {low:>10.4}  max {high:>10.4}  mean {mean:>10.4}", array.name)?;
+        say!(
+            "{:32} {shape:>12}  min {low:>10.4}  max {high:>10.4}  mean {mean:>10.4}",
+            array.name
+        )?;
     }
     Ok(())
 }

@@ -5,8 +5,8 @@ use super::train::{HeadTrainArgs, train_head};
 use crate::cli::output::say;
 use crate::eval::datasets::list_images as images_below;
 use crate::extract::{
-    Aggregate, Covariance, ExtractConfig, Extractor, Head, HeadChoice, VladWords, half_whitened_head_of_few, hash_file,
-    sample_tokens,
+    Aggregate, Covariance, ExtractConfig, Extractor, Head, HeadChoice, VladWords,
+    half_whitened_head_of_few, hash_file, sample_tokens,
 };
 use crate::image::{ImageConfig, load_tensor};
 use crate::types::ImageTensor;
@@ -32,8 +32,9 @@ enum HeadCommand {
     Fit(FitArgs),
     /// Train a head on places with triplets; the same as `train --trainable head`.
     ///
-    /// Every image is encoded once and its pooled tokens are kept in the user's cache (--cache), so that a step costs a
-    /// matrix product: minutes on a CPU. The head that --head names is where it starts, and says how tokens are pooled.
+    /// Every image is encoded once and its pooled tokens are kept in the user's cache (--cache), so
+    /// that a step costs a matrix product: minutes on a CPU. The head that --head names is where it
+    /// starts, and says how tokens are pooled.
     Train(HeadTrainArgs),
 }
 
@@ -45,7 +46,8 @@ struct FitArgs {
     /// Where the head goes.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// How patch tokens become one vector. It is carried by the head and becomes part of the model's identity.
+    /// How patch tokens become one vector. It is carried by the head and becomes part of the
+    /// model's identity.
     #[arg(long, value_enum, default_value_t)]
     aggregate: AggregateKind,
     /// Power of the generalised mean, 1 to 64; 1 is the mean.
@@ -73,12 +75,14 @@ enum AggregateKind {
     Vlad,
 }
 
-/// Images decoded together while the transformer waits, and encoded together while the decoder does.
+/// Images decoded together while the transformer waits, and encoded together while the decoder
+/// does.
 const BATCH: usize = 16;
 /// Images that visual words are learnt from, evenly spread over all, and tokens drawn from each.
 const WORD_IMAGES: usize = 256;
 const WORD_TOKENS: usize = 100;
-/// Most images behind a PCA of vectors too long for a covariance matrix; the cost grows with its cube.
+/// Most images behind a PCA of vectors too long for a covariance matrix; the cost grows with its
+/// cube.
 const MOST_LONG_VECTORS: usize = 2048;
 
 /// Runs it.
@@ -91,25 +95,44 @@ pub fn run(args: HeadArgs) -> anyhow::Result<()> {
 
 fn fit(args: FitArgs) -> anyhow::Result<()> {
     let files = training_images(&args.images)?;
-    let config = ExtractConfig { head: HeadChoice::None, ..args.model.extract_config()? };
+    let config = ExtractConfig {
+        head: HeadChoice::None,
+        ..args.model.extract_config()?
+    };
     // A power that cannot be used is refused before the model is loaded.
     let gem = Aggregate::gem(args.gem_p).map_err(anyhow::Error::msg);
-    let gem = if args.aggregate == AggregateKind::Gem { Some(gem?) } else { None };
-    let mut reader = Reader { extractor: Extractor::open(&config)?, unreadable: BTreeSet::new() };
+    let gem = if args.aggregate == AggregateKind::Gem {
+        Some(gem?)
+    } else {
+        None
+    };
+    let mut reader = Reader {
+        extractor: Extractor::open(&config)?,
+        unreadable: BTreeSet::new(),
+    };
     let (aggregate, files) = match (args.aggregate, gem) {
-        (AggregateKind::Vlad, _) => {
-            (Aggregate::Vlad(reader.visual_words(&files, &args)?), spread(&files, MOST_LONG_VECTORS))
-        }
+        (AggregateKind::Vlad, _) => (
+            Aggregate::Vlad(reader.visual_words(&files, &args)?),
+            spread(&files, MOST_LONG_VECTORS),
+        ),
         (_, Some(gem)) => (gem, files),
         (_, None) => (Aggregate::Mean, files),
     };
     let (head, images) = reader.fit(&files, aggregate)?;
-    reader.unreadable.iter().for_each(|line| eprintln!("left out: {line}"));
+    reader
+        .unreadable
+        .iter()
+        .for_each(|line| eprintln!("left out: {line}"));
     if let Some(directory) = args.out.parent() {
         std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
     }
     head.save(&args.out)?;
-    say!("{} ({}) from {images} images for {}", args.out.display(), head.aggregate(), head.backbone())?;
+    say!(
+        "{} ({}) from {images} images for {}",
+        args.out.display(),
+        head.aggregate(),
+        head.backbone()
+    )?;
     say!("sha256 {}", hash_file(&args.out)?)?;
     Ok(())
 }
@@ -123,23 +146,38 @@ struct Reader {
 impl Reader {
     fn visual_words(&mut self, files: &[PathBuf], args: &FitArgs) -> anyhow::Result<VladWords> {
         let (mut tokens, dim, mut number) = (Vec::new(), self.extractor.dim(), args.seed);
-        self.each_batch(&spread(files, WORD_IMAGES), "sampling tokens", |extractor, tensors| {
-            for encoded in extractor.encode(tensors)? {
-                tokens.extend(sample_tokens(&encoded.tokens, dim, WORD_TOKENS, number));
-                number = number.wrapping_add(1);
-            }
-            Ok(())
-        })?;
-        Ok(VladWords::fit(&tokens, dim, usize::from(args.words), args.seed)?)
+        self.each_batch(
+            &spread(files, WORD_IMAGES),
+            "sampling tokens",
+            |extractor, tensors| {
+                for encoded in extractor.encode(tensors)? {
+                    tokens.extend(sample_tokens(&encoded.tokens, dim, WORD_TOKENS, number));
+                    number = number.wrapping_add(1);
+                }
+                Ok(())
+            },
+        )?;
+        Ok(VladWords::fit(
+            &tokens,
+            dim,
+            usize::from(args.words),
+            args.seed,
+        )?)
     }
 
     /// The head, and from how many images.
     fn fit(&mut self, files: &[PathBuf], aggregate: Aggregate) -> anyhow::Result<(Head, usize)> {
-        let method = format!("PCA with half whitening of L2-normalised {} tokens", aggregate.kind());
+        let method = format!(
+            "PCA with half whitening of L2-normalised {} tokens",
+            aggregate.kind()
+        );
         let dim = aggregate.pooled_dim(self.extractor.dim());
         let mut notes = BTreeMap::from([
             ("method".to_owned(), method),
-            ("input_size".to_owned(), self.extractor.input_size().to_string()),
+            (
+                "input_size".to_owned(),
+                self.extractor.input_size().to_string(),
+            ),
         ]);
         let backbone = self.extractor.backbone().to_owned();
         if matches!(aggregate, Aggregate::Vlad(_)) {
@@ -149,16 +187,25 @@ impl Reader {
                 Ok(())
             })?;
             notes.insert("images".into(), vectors.len().to_string());
-            return Ok((half_whitened_head_of_few(&vectors, aggregate, &backbone, notes)?, vectors.len()));
+            return Ok((
+                half_whitened_head_of_few(&vectors, aggregate, &backbone, notes)?,
+                vectors.len(),
+            ));
         }
         let mut covariance = Covariance::new(dim);
         self.each_batch(files, "describing images", |extractor, tensors| {
-            extractor.pooled_by(tensors, &aggregate)?.iter().for_each(|pooled| covariance.add(pooled));
+            extractor
+                .pooled_by(tensors, &aggregate)?
+                .iter()
+                .for_each(|pooled| covariance.add(pooled));
             Ok(())
         })?;
         let images = covariance.count();
         notes.insert("images".into(), images.to_string());
-        Ok((covariance.half_whitened_head(aggregate, &backbone, notes)?, images))
+        Ok((
+            covariance.half_whitened_head(aggregate, &backbone, notes)?,
+            images,
+        ))
     }
 
     fn each_batch(
@@ -167,16 +214,23 @@ impl Reader {
         message: &'static str,
         mut visit: impl FnMut(&Extractor, &[ImageTensor]) -> anyhow::Result<()>,
     ) -> anyhow::Result<()> {
-        let style = ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} {per_sec} {eta} left")?;
-        let bar = ProgressBar::new(files.len() as u64).with_style(style).with_message(message);
+        let style =
+            ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} {per_sec} {eta} left")?;
+        let bar = ProgressBar::new(files.len() as u64)
+            .with_style(style)
+            .with_message(message);
         for batch in files.chunks(BATCH) {
-            let decoded: Vec<_> = batch.par_iter().map(|path| (path, decode(path, &self.extractor))).collect();
+            let decoded: Vec<_> = batch
+                .par_iter()
+                .map(|path| (path, decode(path, &self.extractor)))
+                .collect();
             let mut tensors = Vec::with_capacity(batch.len());
             for (path, tensor) in decoded {
                 match tensor {
                     Ok(tensor) => tensors.push(tensor),
                     Err(error) => {
-                        self.unreadable.insert(format!("{}: {error:#}", path.display()));
+                        self.unreadable
+                            .insert(format!("{}: {error:#}", path.display()));
                     }
                 }
             }
@@ -190,13 +244,19 @@ impl Reader {
 
 fn decode(path: &Path, extractor: &Extractor) -> anyhow::Result<ImageTensor> {
     let bytes = std::fs::read(path)?;
-    Ok(load_tensor(&bytes, &ImageConfig::default(), extractor.input_size())?)
+    Ok(load_tensor(
+        &bytes,
+        &ImageConfig::default(),
+        extractor.input_size(),
+    )?)
 }
 
 /// At most `count` of `files`, evenly spread.
 fn spread(files: &[PathBuf], count: usize) -> Vec<PathBuf> {
     let step = (files.len() as f64 / count as f64).max(1.0);
-    (0..files.len().min(count)).map(|i| files[(i as f64 * step) as usize].clone()).collect()
+    (0..files.len().min(count))
+        .map(|i| files[(i as f64 * step) as usize].clone())
+        .collect()
 }
 
 /// Every image below `directories`, sorted, so that a fit can be repeated.
@@ -205,6 +265,9 @@ fn training_images(directories: &[PathBuf]) -> anyhow::Result<Vec<PathBuf>> {
     for directory in directories {
         files.extend(images_below(directory)?.into_iter().map(|(_, path)| path));
     }
-    anyhow::ensure!(!files.is_empty(), "there are no images in the given directories");
+    anyhow::ensure!(
+        !files.is_empty(),
+        "there are no images in the given directories"
+    );
     Ok(files)
 }

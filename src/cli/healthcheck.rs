@@ -19,8 +19,8 @@ pub struct HealthcheckArgs {
 
 /// Succeeds if the server is ready for queries; fails with its own reason if not.
 ///
-/// A full disk alone is no failure: a supervisor that restarted the server, or a balancer that left it out, would end
-/// the queries and deletions that still work and gain nothing.
+/// A full disk alone is no failure: a supervisor that restarted the server, or a balancer that left
+/// it out, would end the queries and deletions that still work and gain nothing.
 pub fn run(args: HealthcheckArgs) -> anyhow::Result<()> {
     let path = match (args.live, args.ingest) {
         (true, _) => "/livez",

@@ -1,4 +1,5 @@
-//! Inspect and delete maps of a running server; give maps another head, there or in a data directory.
+//! Inspect and delete maps of a running server; give maps another head, there or in a data
+//! directory.
 
 use super::client::{ServerArgs, ServerClient};
 use crate::cli::output::{say, say_part};
@@ -48,15 +49,17 @@ enum Action {
     },
     /// Give maps another head, without their images.
     ///
-    /// A reference keeps its pooled patch tokens beside its key patches. They are projected anew, and one
-    /// transaction then binds the map to the new model: interrupted before, it is as it was. Key
-    /// patches, metadata and identities stay; a map's calibration is cleared, because distances mean something else.
+    /// A reference keeps its pooled patch tokens beside its key patches. They are projected anew,
+    /// and one transaction then binds the map to the new model: interrupted before, it is as it
+    /// was. Key patches, metadata and identities stay; a map's calibration is cleared, because
+    /// distances mean something else.
     ///
-    /// The head must be made for the map's backbone and pool tokens as the map's old head did: a mean cannot become a
-    /// VLAD, nor one generalised mean another, without the images. Such a head is refused.
+    /// The head must be made for the map's backbone and pool tokens as the map's old head did: a
+    /// mean cannot become a VLAD, nor one generalised mean another, without the images. Such a head
+    /// is refused.
     ///
-    /// A map keeps its head, whatever head its server runs. Through a running server, queries are answered throughout:
-    /// with the old head until all is ready, with the new one from then on.
+    /// A map keeps its head, whatever head its server runs. Through a running server, queries are
+    /// answered throughout: with the old head until all is ready, with the new one from then on.
     Rehead(ReheadArgs),
 }
 
@@ -70,7 +73,8 @@ struct ReheadArgs {
     /// The new head, as `head fit`, `head train` or `train` wrote it.
     #[arg(long, value_name = "FILE")]
     head: Option<PathBuf>,
-    /// Let the maps go with the head that the server runs; also brings over maps that a server with another head made.
+    /// Let the maps go with the head that the server runs; also brings over maps that a server with
+    /// another head made.
     #[arg(long, conflicts_with = "data")]
     server_head: bool,
     /// The running server.
@@ -83,7 +87,12 @@ struct ReheadArgs {
     #[arg(long, env = "PLACEFORMER_CONFIG", value_name = "FILE")]
     config: Option<PathBuf>,
     /// API key, where the server wants one.
-    #[arg(long, env = "PLACEFORMER_API_KEY", hide_env_values = true, value_name = "KEY")]
+    #[arg(
+        long,
+        env = "PLACEFORMER_API_KEY",
+        hide_env_values = true,
+        value_name = "KEY"
+    )]
     api_key: Option<String>,
     /// Seconds to wait for one map. A server that is no longer waited for goes on all the same.
     #[arg(long, default_value_t = 3600, value_name = "SECONDS")]
@@ -106,11 +115,19 @@ pub fn run(args: MapArgs) -> anyhow::Result<()> {
 
 fn list(client: &ServerClient) -> anyhow::Result<()> {
     let answer = client.get("/maps")?;
-    let maps = answer["maps"].as_array().map(Vec::as_slice).unwrap_or_default();
+    let maps = answer["maps"]
+        .as_array()
+        .map(Vec::as_slice)
+        .unwrap_or_default();
     say!("{:<32} {:>12}  model", "map", "references")?;
     for map in maps {
         let text = |key: &str| map[key].as_str().unwrap_or_default();
-        say!("{:<32} {:>12}  {}", text("name"), map["references"].as_u64().unwrap_or_default(), text("model"))?;
+        say!(
+            "{:<32} {:>12}  {}",
+            text("name"),
+            map["references"].as_u64().unwrap_or_default(),
+            text("model")
+        )?;
     }
     Ok(())
 }
@@ -134,15 +151,31 @@ fn confirmed(map: &MapName, references: &Value) -> anyhow::Result<bool> {
 }
 
 fn rehead(args: ReheadArgs) -> anyhow::Result<()> {
-    let ReheadArgs { maps, head, server, data, config, api_key, timeout, .. } = args;
-    // Read here first, so that a file that is no head is told by its name and before any map is touched.
+    let ReheadArgs {
+        maps,
+        head,
+        server,
+        data,
+        config,
+        api_key,
+        timeout,
+        ..
+    } = args;
+    // Read here first, so that a file that is no head is told by its name and before any map is
+    // touched.
     let head = head.map(|path| read_head(&path)).transpose()?;
     match (server, data, head) {
         (Some(server), _, head) => {
-            let client = ServerClient::new(ServerArgs { server, api_key, timeout })?;
+            let client = ServerClient::new(ServerArgs {
+                server,
+                api_key,
+                timeout,
+            })?;
             rehead_live(&client, &maps, head.map(|(_, file)| file).as_deref())
         }
-        (None, Some(data), Some((head, file))) => rehead_stopped(&maps, &head, &file, (&data, config.as_deref())),
+        (None, Some(data), Some((head, file))) => {
+            rehead_stopped(&maps, &head, &file, (&data, config.as_deref()))
+        }
         // The groups of the arguments leave nothing else.
         _ => bail!("give --head with --data, or --head or --server-head with --server"),
     }
@@ -161,8 +194,14 @@ fn rehead_live(client: &ServerClient, maps: &[MapName], file: Option<&[u8]>) -> 
             None => client.delete(&path),
         };
         let answer = answer.with_context(|| format!("map {map} was not given another head"))?;
-        let (references, model) = (&answer["references"], answer["model"].as_str().unwrap_or_default());
-        say!("map {map}: {references} references, now {model} ({:.1} s)", begun.elapsed().as_secs_f64())?;
+        let (references, model) = (
+            &answer["references"],
+            answer["model"].as_str().unwrap_or_default(),
+        );
+        say!(
+            "map {map}: {references} references, now {model} ({:.1} s)",
+            begun.elapsed().as_secs_f64()
+        )?;
     }
     Ok(())
 }
@@ -180,7 +219,9 @@ fn rehead_stopped(
     let mut plan = Vec::new();
     for map in maps {
         let info = store.map(map)?;
-        let model = head.rebind(&info.model).with_context(|| format!("map {map} cannot take this head"))?;
+        let model = head
+            .rebind(&info.model)
+            .with_context(|| format!("map {map} cannot take this head"))?;
         plan.push((info, model));
     }
     for (info, model) in plan {
@@ -189,12 +230,20 @@ fn rehead_stopped(
             say!("map {} has this head already: {model}", info.name)?;
             continue;
         }
-        let style = ProgressStyle::with_template("projecting {wide_bar} {pos}/{len} {per_sec} {eta}")?;
+        let style =
+            ProgressStyle::with_template("projecting {wide_bar} {pos}/{len} {per_sec} {eta}")?;
         let bar = ProgressBar::new(info.references).with_style(style);
-        let new = NewHead { model: model.clone(), file: Some(file.to_vec()) };
+        let new = NewHead {
+            model: model.clone(),
+            file: Some(file.to_vec()),
+        };
         store.replace_globals(&info.name, new, &mut Projecting { head, bar: &bar })?;
         bar.finish_and_clear();
-        say!("map {}: {} references, now {model}", info.name, info.references)?;
+        say!(
+            "map {}: {} references, now {model}",
+            info.name,
+            info.references
+        )?;
     }
     Ok(())
 }
@@ -207,6 +256,9 @@ struct Projecting<'a> {
 impl HeadExchange for Projecting<'_> {
     fn project(&mut self, pooled: &[Vec<f32>]) -> Vec<Vec<f32>> {
         self.bar.inc(pooled.len() as u64);
-        pooled.par_iter().map(|pooled| self.head.project_stored(pooled)).collect()
+        pooled
+            .par_iter()
+            .map(|pooled| self.head.project_stored(pooled))
+            .collect()
     }
 }

@@ -18,7 +18,8 @@ pub struct MatchArgs {
     query: PathBuf,
     /// Reference image.
     reference: PathBuf,
-    /// Where both images, their attention and key patches, and the inliers are drawn, as PNG or JPEG.
+    /// Where both images, their attention and key patches, and the inliers are drawn, as PNG or
+    /// JPEG.
     #[arg(long, value_name = "FILE", default_value = "match.png")]
     out: PathBuf,
     /// Draw nothing.
@@ -28,7 +29,12 @@ pub struct MatchArgs {
     #[arg(long)]
     json: bool,
     /// Scale combinations whose inliers add up to S.
-    #[arg(long, value_delimiter = ',', default_value = "1,1+2,2+3", value_name = "SET,...")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_value = "1,1+2,2+3",
+        value_name = "SET,..."
+    )]
     scales: Vec<ScaleSet>,
     #[command(flatten)]
     model: ModelOptions,
@@ -36,21 +42,33 @@ pub struct MatchArgs {
 
 /// Runs it.
 pub fn run(args: MatchArgs) -> anyhow::Result<()> {
-    let rerank = RerankConfig { scales: args.scales.clone(), ..Default::default() };
+    let rerank = RerankConfig {
+        scales: args.scales.clone(),
+        ..Default::default()
+    };
     rerank.check()?;
     crate::kernels::self_check()?;
-    let encode = if args.no_picture { None } else { Some(encoder(&args.out)?) };
+    let encode = if args.no_picture {
+        None
+    } else {
+        Some(encoder(&args.out)?)
+    };
     let extractor = Extractor::open(&args.model.extract_config()?)?;
     let limits = ImageConfig::default();
     let see = |path: &Path| {
-        let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-        Seen::new(&extractor, &limits, &bytes).with_context(|| format!("cannot use {}", path.display()))
+        let bytes =
+            std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+        Seen::new(&extractor, &limits, &bytes)
+            .with_context(|| format!("cannot use {}", path.display()))
     };
     let (query, reference) = (see(&args.query)?, see(&args.reference)?);
     let reranker = Reranker::new(rerank);
     let matches = reranker.explain(&query.patches, &reference.patches);
     if args.json {
-        say!("{}", serde_json::to_string_pretty(&as_json(&query, &reference, &matches))?)?;
+        say!(
+            "{}",
+            serde_json::to_string_pretty(&as_json(&query, &reference, &matches))?
+        )?;
     } else {
         print_counts(&query, &reference, &matches)?;
     }
@@ -67,11 +85,17 @@ type Encode = fn(&crate::image::RgbImage) -> anyhow::Result<Vec<u8>>;
 
 /// Chosen before the model is loaded, so that a wrong name costs nothing.
 fn encoder(path: &Path) -> anyhow::Result<Encode> {
-    let extension = path.extension().and_then(|extension| extension.to_str()).unwrap_or_default();
+    let extension = path
+        .extension()
+        .and_then(|extension| extension.to_str())
+        .unwrap_or_default();
     match extension.to_ascii_lowercase().as_str() {
         "png" => Ok(|image| Ok(encode_png(image)?)),
         "jpg" | "jpeg" => Ok(|image| Ok(encode_jpeg(image, 90)?)),
-        _ => bail!("{}: the picture must end in .png, .jpg or .jpeg", path.display()),
+        _ => bail!(
+            "{}: the picture must end in .png, .jpg or .jpeg",
+            path.display()
+        ),
     }
 }
 
@@ -80,16 +104,36 @@ fn spatial_score(matches: &[CombinationMatch]) -> u32 {
 }
 
 fn global_distance(query: &Seen, reference: &Seen) -> f32 {
-    query.global.iter().zip(&reference.global).map(|(a, b)| (a - b) * (a - b)).sum::<f32>().sqrt()
+    query
+        .global
+        .iter()
+        .zip(&reference.global)
+        .map(|(a, b)| (a - b) * (a - b))
+        .sum::<f32>()
+        .sqrt()
 }
 
-fn print_counts(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) -> Result<(), OutputError> {
-    let counts = |seen: &Seen| seen.patches.counts.map(|count| count.to_string()).join(" / ");
+fn print_counts(
+    query: &Seen,
+    reference: &Seen,
+    matches: &[CombinationMatch],
+) -> Result<(), OutputError> {
+    let counts = |seen: &Seen| {
+        seen.patches
+            .counts
+            .map(|count| count.to_string())
+            .join(" / ")
+    };
     say!("key patches   {} and {}", counts(query), counts(reference))?;
     say!("distance      {:.4}", global_distance(query, reference))?;
     for found in matches {
         let score = found.score;
-        say!("{:<13} {} inliers of {} matches", score.scales.score_name(), score.inliers, score.matches)?;
+        say!(
+            "{:<13} {} inliers of {} matches",
+            score.scales.score_name(),
+            score.inliers,
+            score.matches
+        )?;
     }
     say!("S             {}", spatial_score(matches))
 }
@@ -97,7 +141,8 @@ fn print_counts(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) ->
 fn as_json(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) -> Value {
     let side = |seen: &Seen| {
         let grid = seen.patches.grid;
-        let input = [u32::from(grid.columns), u32::from(grid.rows)].map(|n| n * u32::from(grid.patch_px));
+        let input =
+            [u32::from(grid.columns), u32::from(grid.rows)].map(|n| n * u32::from(grid.patch_px));
         json!({ "key_patches": seen.patches.counts, "input_size": input })
     };
     let combination = |found: &CombinationMatch| {

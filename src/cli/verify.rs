@@ -21,13 +21,20 @@ pub struct VerifyArgs {
 
 /// Reads everything, quarantines what is damaged, and fails if anything was.
 pub fn run(args: VerifyArgs) -> anyhow::Result<()> {
-    ensure!(args.data.is_dir(), "there is no store in {}", args.data.display());
+    ensure!(
+        args.data.is_dir(),
+        "there is no store in {}",
+        args.data.display()
+    );
     let config = Config::load(args.config.as_deref(), &Overrides::default())?;
     let store = super::serve::open_store(&args.data, &config.store)?;
     let report = store.verify().context("the store cannot be read")?;
     if args.json {
-        let damaged: Vec<_> =
-            report.damaged.iter().map(|(id, reason)| serde_json::json!({"reference": id, "reason": reason})).collect();
+        let damaged: Vec<_> = report
+            .damaged
+            .iter()
+            .map(|(id, reason)| serde_json::json!({"reference": id, "reason": reason}))
+            .collect();
         let report = serde_json::json!({
             "references": report.references, "damaged": damaged, "engine_errors": report.engine_errors,
         });
@@ -42,7 +49,10 @@ pub fn run(args: VerifyArgs) -> anyhow::Result<()> {
         }
     }
     let found = report.damaged.len() + report.engine_errors.len();
-    ensure!(found == 0, "{found} faults found; damaged references are quarantined and no longer served");
+    ensure!(
+        found == 0,
+        "{found} faults found; damaged references are quarantined and no longer served"
+    );
     say!("all checksums hold")?;
     Ok(())
 }

@@ -1,9 +1,12 @@
-//! A tiny-skia surface with the few marks these pictures need: images, squares, lines, dots and score labels.
+//! A tiny-skia surface with the few marks these pictures need: images, squares, lines, dots and
+//! score labels.
 
 use super::DrawError;
 use crate::image::RgbImage;
 use crate::types::ImageSize;
-use tiny_skia::{Color, FillRule, Paint, PathBuilder, Pixmap, PremultipliedColorU8, Rect, Stroke, Transform};
+use tiny_skia::{
+    Color, FillRule, Paint, PathBuilder, Pixmap, PremultipliedColorU8, Rect, Stroke, Transform,
+};
 
 /// A colour with its opacity, each 0 to 255.
 pub(super) type Rgba = [u8; 4];
@@ -21,7 +24,12 @@ pub(super) struct Canvas(Pixmap);
 impl Canvas {
     pub(super) fn new(size: ImageSize, background: [u8; 3]) -> Result<Self, DrawError> {
         let mut pixmap = Pixmap::new(size.width, size.height).ok_or(DrawError::Size(size))?;
-        pixmap.fill(Color::from_rgba8(background[0], background[1], background[2], 255));
+        pixmap.fill(Color::from_rgba8(
+            background[0],
+            background[1],
+            background[2],
+            255,
+        ));
         Ok(Self(pixmap))
     }
 
@@ -29,7 +37,12 @@ impl Canvas {
     pub(super) fn place(&mut self, image: &RgbImage, panel: Panel) {
         let stride = self.0.width() as usize;
         let width = panel.size.width as usize;
-        for (row, rgb_row) in image.pixels.chunks_exact(width * 3).take(panel.size.height as usize).enumerate() {
+        for (row, rgb_row) in image
+            .pixels
+            .chunks_exact(width * 3)
+            .take(panel.size.height as usize)
+            .enumerate()
+        {
             let start = (panel.top as usize + row) * stride + panel.left as usize;
             let out = &mut self.0.pixels_mut()[start..start + width];
             for (out, rgb) in out.iter_mut().zip(rgb_row.chunks_exact(3)) {
@@ -43,8 +56,17 @@ impl Canvas {
     pub(super) fn square(&mut self, centre: [f32; 2], side: f32, colour: Rgba, width: f32) {
         let half = side / 2.0;
         if let Some(rect) = Rect::from_xywh(centre[0] - half, centre[1] - half, side, side) {
-            let stroke = Stroke { width, ..Default::default() };
-            self.0.stroke_path(&PathBuilder::from_rect(rect), &paint(colour), &stroke, Transform::identity(), None);
+            let stroke = Stroke {
+                width,
+                ..Default::default()
+            };
+            self.0.stroke_path(
+                &PathBuilder::from_rect(rect),
+                &paint(colour),
+                &stroke,
+                Transform::identity(),
+                None,
+            );
         }
     }
 
@@ -53,24 +75,36 @@ impl Canvas {
         path.move_to(from[0], from[1]);
         path.line_to(to[0], to[1]);
         if let Some(path) = path.finish() {
-            let stroke = Stroke { width, ..Default::default() };
-            self.0.stroke_path(&path, &paint(colour), &stroke, Transform::identity(), None);
+            let stroke = Stroke {
+                width,
+                ..Default::default()
+            };
+            self.0
+                .stroke_path(&path, &paint(colour), &stroke, Transform::identity(), None);
         }
     }
 
     pub(super) fn dot(&mut self, centre: [f32; 2], radius: f32, colour: Rgba) {
         if let Some(path) = PathBuilder::from_circle(centre[0], centre[1], radius) {
-            self.0.fill_path(&path, &paint(colour), FillRule::Winding, Transform::identity(), None);
+            self.0.fill_path(
+                &path,
+                &paint(colour),
+                FillRule::Winding,
+                Transform::identity(),
+                None,
+            );
         }
     }
 
     pub(super) fn fill(&mut self, left: f32, top: f32, width: f32, height: f32, colour: Rgba) {
         if let Some(rect) = Rect::from_xywh(left, top, width, height) {
-            self.0.fill_rect(rect, &paint(colour), Transform::identity(), None);
+            self.0
+                .fill_rect(rect, &paint(colour), Transform::identity(), None);
         }
     }
 
-    /// Writes digits, `s`, `/`, `+` and spaces in cells of 6x7 dots of `dot` pixels; returns the width used.
+    /// Writes digits, `s`, `/`, `+` and spaces in cells of 6x7 dots of `dot` pixels; returns the
+    /// width used.
     pub(super) fn label(&mut self, text: &str, left: f32, top: f32, dot: f32, colour: Rgba) -> f32 {
         for (cell, glyph) in text.chars().map(glyph).enumerate() {
             for (row, bits) in glyph.into_iter().enumerate() {
@@ -84,9 +118,17 @@ impl Canvas {
     }
 
     pub(super) fn finish(self) -> RgbImage {
-        let size = ImageSize { width: self.0.width(), height: self.0.height() };
+        let size = ImageSize {
+            width: self.0.width(),
+            height: self.0.height(),
+        };
         // The background is opaque, so premultiplied colours are the colours themselves.
-        let pixels = self.0.pixels().iter().flat_map(|pixel| [pixel.red(), pixel.green(), pixel.blue()]).collect();
+        let pixels = self
+            .0
+            .pixels()
+            .iter()
+            .flat_map(|pixel| [pixel.red(), pixel.green(), pixel.blue()])
+            .collect();
         RgbImage { size, pixels }
     }
 }

@@ -1,8 +1,9 @@
 //! Pictures of matches: both images, attention, key patches, inlier lines.
 //!
-//! A score is a number; an operator who doubts it wants to see why. [`match_picture`] shows what re-ranking saw, in
-//! rows: where both images draw attention and which key patches came of it, then one row per scale combination with
-//! a line for every inlier. Everything is given as plain values, so that drawing depends on no stage.
+//! A score is a number; an operator who doubts it wants to see why. [`match_picture`] shows what
+//! re-ranking saw, in rows: where both images draw attention and which key patches came of it, then
+//! one row per scale combination with a line for every inlier. Everything is given as plain values,
+//! so that drawing depends on no stage.
 
 mod canvas;
 mod panels;
@@ -47,7 +48,9 @@ impl DrawError {
     /// The row of the error table.
     pub fn code(&self) -> ErrorCode {
         match self {
-            Self::AttentionShape { .. } | Self::NoSuchPatch { .. } | Self::Size(_) => ErrorCode::Internal,
+            Self::AttentionShape { .. } | Self::NoSuchPatch { .. } | Self::Size(_) => {
+                ErrorCode::Internal
+            }
             Self::Image(error) => error.code(),
         }
     }
@@ -66,8 +69,13 @@ pub fn thumbnail(image: &RgbImage, longest_side: u32) -> Result<RgbImage, DrawEr
         return Ok(image.clone());
     }
     // Both factors are 32-bit, so the product fits; the quotient is at most the side itself.
-    let fit = |side: u32| ((u64::from(side) * u64::from(longest_side) / u64::from(longest)) as u32).max(1);
-    Ok(image.resized(ImageSize { width: fit(image.size.width), height: fit(image.size.height) })?)
+    let fit = |side: u32| {
+        ((u64::from(side) * u64::from(longest_side) / u64::from(longest)) as u32).max(1)
+    };
+    Ok(image.resized(ImageSize {
+        width: fit(image.size.width),
+        height: fit(image.size.height),
+    })?)
 }
 
 /// `image` as a `data:image/jpeg;base64,...` URI, for pages that must stand alone.
@@ -86,20 +94,55 @@ mod tests {
 
     #[test]
     fn thumbnails_keep_the_shape_and_never_grow() {
-        let image = RgbImage::filled(ImageSize { width: 640, height: 480 }, [9, 9, 9]);
-        assert_eq!(thumbnail(&image, 160).unwrap().size, ImageSize { width: 160, height: 120 });
+        let image = RgbImage::filled(
+            ImageSize {
+                width: 640,
+                height: 480,
+            },
+            [9, 9, 9],
+        );
+        assert_eq!(
+            thumbnail(&image, 160).unwrap().size,
+            ImageSize {
+                width: 160,
+                height: 120
+            }
+        );
         assert_eq!(thumbnail(&image, 1000).unwrap(), image);
-        let line = RgbImage::filled(ImageSize { width: 3000, height: 1 }, [9, 9, 9]);
-        assert_eq!(thumbnail(&line, 100).unwrap().size, ImageSize { width: 100, height: 1 });
+        let line = RgbImage::filled(
+            ImageSize {
+                width: 3000,
+                height: 1,
+            },
+            [9, 9, 9],
+        );
+        assert_eq!(
+            thumbnail(&line, 100).unwrap().size,
+            ImageSize {
+                width: 100,
+                height: 1
+            }
+        );
         assert!(thumbnail(&image, 0).is_err());
     }
 
     #[test]
     fn a_data_uri_holds_the_picture() {
-        let image = RgbImage::filled(ImageSize { width: 16, height: 16 }, [200, 30, 30]);
+        let image = RgbImage::filled(
+            ImageSize {
+                width: 16,
+                height: 16,
+            },
+            [200, 30, 30],
+        );
         let uri = jpeg_data_uri(&image, 90).unwrap();
         let payload = uri.strip_prefix("data:image/jpeg;base64,").unwrap();
-        let bytes = base64::engine::general_purpose::STANDARD.decode(payload).unwrap();
-        assert_eq!(decode(&bytes, &ImageConfig::default()).unwrap().size, image.size);
+        let bytes = base64::engine::general_purpose::STANDARD
+            .decode(payload)
+            .unwrap();
+        assert_eq!(
+            decode(&bytes, &ImageConfig::default()).unwrap().size,
+            image.size
+        );
     }
 }

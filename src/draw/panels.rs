@@ -15,10 +15,19 @@ const GAP: u32 = 8;
 const CAPTION: u32 = 24;
 const BACKGROUND: [u8; 3] = [20, 22, 27];
 /// Scales 1, 2, 3: told apart by hue, by lightness and by size.
-const SCALE_COLOURS: [Rgba; SCALES] = [[86, 214, 255, 235], [255, 196, 61, 240], [255, 98, 190, 245]];
+const SCALE_COLOURS: [Rgba; SCALES] = [
+    [86, 214, 255, 235],
+    [255, 196, 61, 240],
+    [255, 98, 190, 245],
+];
 /// One colour per combination, repeated beyond five.
-const LINE_COLOURS: [Rgba; 5] =
-    [[94, 231, 138, 255], [255, 179, 71, 255], [122, 183, 255, 255], [255, 122, 158, 255], [214, 173, 255, 255]];
+const LINE_COLOURS: [Rgba; 5] = [
+    [94, 231, 138, 255],
+    [255, 179, 71, 255],
+    [122, 183, 255, 255],
+    [255, 122, 158, 255],
+    [214, 173, 255, 255],
+];
 
 /// The attention of one image: one value per patch of the grid, any positive unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,11 +62,12 @@ pub struct CombinationLines<'a> {
     pub inliers: &'a [(u32, u32)],
 }
 
-/// Both images side by side: a row with attention and key patches (scale 1 blue, 2 amber, 3 pink), then a row of
-/// inlier lines per combination, labelled `s12 inliers/matches`.
+/// Both images side by side: a row with attention and key patches (scale 1 blue, 2 amber, 3 pink),
+/// then a row of inlier lines per combination, labelled `s12 inliers/matches`.
 ///
 /// # Errors
-/// An image without pixels, an attention map that does not fill its grid, or an inlier that names no patch.
+/// An image without pixels, an attention map that does not fill its grid, or an inlier that names
+/// no patch.
 pub fn match_picture(
     query: &MatchSide,
     reference: &MatchSide,
@@ -71,12 +81,22 @@ pub fn match_picture(
     };
     let mut canvas = Canvas::new(size, BACKGROUND)?;
     let panels = |top: u32| {
-        let panel = |left, width| Panel { left, top, size: ImageSize { width, height: PANEL_HEIGHT } };
+        let panel = |left, width| Panel {
+            left,
+            top,
+            size: ImageSize {
+                width,
+                height: PANEL_HEIGHT,
+            },
+        };
         [panel(GAP, widths[0]), panel(2 * GAP + widths[0], widths[1])]
     };
     let sides = [query, reference];
     let top = panels(GAP);
-    let small = [query.image.resized(top[0].size)?, reference.image.resized(top[1].size)?];
+    let small = [
+        query.image.resized(top[0].size)?,
+        reference.image.resized(top[1].size)?,
+    ];
     for ((side, panel), small) in sides.into_iter().zip(top).zip(&small) {
         match side.attention {
             Some(attention) => canvas.place(&heated(small, attention)?, panel),
@@ -87,11 +107,25 @@ pub fn match_picture(
     for (row, combination) in combinations.iter().enumerate() {
         let caption_top = GAP + PANEL_HEIGHT + GAP + row as u32 * line_row;
         let colour = LINE_COLOURS[row % LINE_COLOURS.len()];
-        let text = format!("{} {}/{}", combination.scales.score_name(), combination.inliers.len(), combination.matches);
+        let text = format!(
+            "{} {}/{}",
+            combination.scales.score_name(),
+            combination.inliers.len(),
+            combination.matches
+        );
         canvas.label(&text, GAP as f32, caption_top as f32 + 4.0, 2.0, colour);
         let row_panels = panels(caption_top + CAPTION);
-        small.iter().zip(row_panels).for_each(|(small, panel)| canvas.place(small, panel));
-        draw_lines(&mut canvas, [query.patches, reference.patches], row_panels, combination.inliers, colour)?;
+        small
+            .iter()
+            .zip(row_panels)
+            .for_each(|(small, panel)| canvas.place(small, panel));
+        draw_lines(
+            &mut canvas,
+            [query.patches, reference.patches],
+            row_panels,
+            combination.inliers,
+            colour,
+        )?;
     }
     Ok(canvas.finish())
 }
@@ -126,7 +160,10 @@ fn on_canvas(patches: &PackedPatches, row: usize, panel: Panel) -> [f32; 2] {
 
 fn pixels_per_input_pixel(patches: &PackedPatches, panel: Panel) -> [f32; 2] {
     let input = |count: u16| f32::from(count) * f32::from(patches.grid.patch_px);
-    [panel.size.width as f32 / input(patches.grid.columns), panel.size.height as f32 / input(patches.grid.rows)]
+    [
+        panel.size.width as f32 / input(patches.grid.columns),
+        panel.size.height as f32 / input(patches.grid.rows),
+    ]
 }
 
 fn draw_patches(canvas: &mut Canvas, patches: &PackedPatches, panel: Panel) {
@@ -154,11 +191,16 @@ fn draw_lines(
 ) -> Result<(), DrawError> {
     let end = |side: usize, row: u32| {
         if row as usize >= patches[side].len() {
-            return Err(DrawError::NoSuchPatch { row, patches: patches[side].len() });
+            return Err(DrawError::NoSuchPatch {
+                row,
+                patches: patches[side].len(),
+            });
         }
         Ok(on_canvas(patches[side], row as usize, panels[side]))
     };
-    let ends = inliers.iter().map(|&(query, reference)| Ok((end(0, query)?, end(1, reference)?)));
+    let ends = inliers
+        .iter()
+        .map(|&(query, reference)| Ok((end(0, query)?, end(1, reference)?)));
     let ends = ends.collect::<Result<Vec<_>, DrawError>>()?;
     // Many lines thin out, so that the pictures beneath stay visible.
     let opacity = if ends.len() > 60 { 120 } else { 200 };
@@ -173,17 +215,34 @@ fn draw_lines(
     Ok(())
 }
 
-/// `image` darkened where attention is low and coloured where it is high, smoothly between patch centres.
+/// `image` darkened where attention is low and coloured where it is high, smoothly between patch
+/// centres.
 fn heated(image: &RgbImage, attention: AttentionMap) -> Result<RgbImage, DrawError> {
-    let AttentionMap { values, columns, rows } = attention;
+    let AttentionMap {
+        values,
+        columns,
+        rows,
+    } = attention;
     if values.is_empty() || values.len() != columns * rows {
-        return Err(DrawError::AttentionShape { values: values.len(), columns, rows });
+        return Err(DrawError::AttentionShape {
+            values: values.len(),
+            columns,
+            rows,
+        });
     }
-    // A few patches (often sky or lens artefacts) tower above the rest: the 98th percentile is already full heat.
-    let mut sorted: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
+    // A few patches (often sky or lens artefacts) tower above the rest: the 98th percentile is
+    // already full heat.
+    let mut sorted: Vec<f32> = values
+        .iter()
+        .copied()
+        .filter(|value| value.is_finite())
+        .collect();
     sorted.sort_by(f32::total_cmp);
-    let peak =
-        sorted.get((sorted.len() * 98).div_ceil(100).saturating_sub(1)).copied().unwrap_or(0.0).max(f32::MIN_POSITIVE);
+    let peak = sorted
+        .get((sorted.len() * 98).div_ceil(100).saturating_sub(1))
+        .copied()
+        .unwrap_or(0.0)
+        .max(f32::MIN_POSITIVE);
     let (width, height) = (image.size.width as usize, image.size.height as usize);
     let mut pixels = Vec::with_capacity(image.pixels.len());
     for (at, rgb) in image.pixels.chunks_exact(3).enumerate() {
@@ -192,9 +251,13 @@ fn heated(image: &RgbImage, attention: AttentionMap) -> Result<RgbImage, DrawErr
         let heat = (interpolate(attention, x, y) / peak).clamp(0.0, 1.0).sqrt();
         let colour = heat_colour(heat);
         let share = 0.25 + 0.4 * heat;
-        pixels.extend((0..3).map(|c| (f32::from(rgb[c]) * (1.0 - share) + colour[c] * share) as u8));
+        pixels
+            .extend((0..3).map(|c| (f32::from(rgb[c]) * (1.0 - share) + colour[c] * share) as u8));
     }
-    Ok(RgbImage { size: image.size, pixels })
+    Ok(RgbImage {
+        size: image.size,
+        pixels,
+    })
 }
 
 /// The map between patch centres, at `x`, `y` in patches.
@@ -211,10 +274,16 @@ fn interpolate(attention: AttentionMap, x: f32, y: f32) -> f32 {
     upper * (1.0 - fy) + lower * fy
 }
 
-/// Black through violet, red and orange to pale yellow: lightness rises all the way, so it also reads in grey.
+/// Black through violet, red and orange to pale yellow: lightness rises all the way, so it also
+/// reads in grey.
 fn heat_colour(heat: f32) -> [f32; 3] {
-    const STOPS: [[f32; 3]; 5] =
-        [[4.0, 4.0, 20.0], [87.0, 16.0, 110.0], [188.0, 55.0, 84.0], [249.0, 142.0, 9.0], [252.0, 255.0, 164.0]];
+    const STOPS: [[f32; 3]; 5] = [
+        [4.0, 4.0, 20.0],
+        [87.0, 16.0, 110.0],
+        [188.0, 55.0, 84.0],
+        [249.0, 142.0, 9.0],
+        [252.0, 255.0, 164.0],
+    ];
     let position = heat * (STOPS.len() - 1) as f32;
     let stop = (position as usize).min(STOPS.len() - 2);
     let along = position - stop as f32;
@@ -229,23 +298,56 @@ mod tests {
 
     fn patches(index: Vec<u16>, counts: [usize; 3]) -> PackedPatches {
         let n = index.len();
-        let grid = PatchGrid { columns: 32, rows: 24, patch_px: 14, stride: PoolingStride::Kernel };
+        let grid = PatchGrid {
+            columns: 32,
+            rows: 24,
+            patch_px: 14,
+            stride: PoolingStride::Kernel,
+        };
         let (attention, factor, codes) = (vec![f16::ONE; n], vec![1.0; n], vec![1; n]);
-        PackedPatches { grid, dim: 1, counts, index, attention, factor, codes }
+        PackedPatches {
+            grid,
+            dim: 1,
+            counts,
+            index,
+            attention,
+            factor,
+            codes,
+        }
     }
 
     fn grey() -> RgbImage {
-        RgbImage::filled(ImageSize { width: 640, height: 480 }, [60, 60, 60])
+        RgbImage::filled(
+            ImageSize {
+                width: 640,
+                height: 480,
+            },
+            [60, 60, 60],
+        )
     }
 
     #[test]
     fn rows_and_panels_add_up_and_lines_join_the_patches() {
         let (image, patches) = (grey(), patches(vec![32 * 12 + 16, 0], [1, 1, 0]));
-        let side = MatchSide { image: &image, attention: None, patches: &patches };
+        let side = MatchSide {
+            image: &image,
+            attention: None,
+            patches: &patches,
+        };
         let scales: ScaleSet = "1+2".parse().unwrap();
-        let lines = CombinationLines { scales, matches: 9, inliers: &[(0, 0)] };
+        let lines = CombinationLines {
+            scales,
+            matches: 9,
+            inliers: &[(0, 0)],
+        };
         let picture = match_picture(&side, &side, &[lines, lines]).unwrap();
-        assert_eq!(picture.size, ImageSize { width: 480 * 2 + 24, height: 8 + 360 + 8 + 2 * 392 });
+        assert_eq!(
+            picture.size,
+            ImageSize {
+                width: 480 * 2 + 24,
+                height: 8 + 360 + 8 + 2 * 392
+            }
+        );
         // The patch lies at 231, 175 of 448 x 336, so at 247.5, 187.5 of a panel of 480 x 360.
         let top = 8 + 360 + 8 + 24;
         let (left_x, right_x, y) = (8 + 247, 16 + 480 + 247, top + 187);
@@ -260,9 +362,14 @@ mod tests {
     #[test]
     fn key_patches_are_outlined_in_the_colour_of_their_scale() {
         let (image, patches) = (grey(), patches(vec![0, 15], [0, 1, 1]));
-        let side = MatchSide { image: &image, attention: None, patches: &patches };
+        let side = MatchSide {
+            image: &image,
+            attention: None,
+            patches: &patches,
+        };
         let picture = match_picture(&side, &side, &[]).unwrap();
-        // The first 2x2 window spans 30 x 30 pixels of the panel at 8, 8; its outline is inset by 1.5.
+        // The first 2x2 window spans 30 x 30 pixels of the panel at 8, 8; its outline is inset by
+        // 1.5.
         let edge = picture.pixel(8 + 15, 8 + 1);
         assert!(edge[0] > 150 && edge[2] < 120, "{edge:?}");
         assert_eq!(picture.pixel(8 + 15, 8 + 15), [60, 60, 60]);
@@ -272,7 +379,15 @@ mod tests {
     fn heat_is_where_the_attention_is() {
         let mut values = vec![0.1; 12];
         values[5] = 5.0;
-        let picture = attention_picture(&grey(), AttentionMap { values: &values, columns: 4, rows: 3 }).unwrap();
+        let picture = attention_picture(
+            &grey(),
+            AttentionMap {
+                values: &values,
+                columns: 4,
+                rows: 3,
+            },
+        )
+        .unwrap();
         let (hot, cold) = (picture.pixel(240, 240), picture.pixel(600, 440));
         assert!(hot[0] > cold[0] + 60, "{hot:?} {cold:?}");
     }
@@ -280,14 +395,41 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_refused() {
         let (image, patches) = (grey(), patches(vec![0], [1, 0, 0]));
-        let map = AttentionMap { values: &[1.0; 5], columns: 2, rows: 3 };
-        assert!(matches!(attention_picture(&image, map), Err(DrawError::AttentionShape { values: 5, .. })));
-        let side = MatchSide { image: &image, attention: None, patches: &patches };
-        let lines = CombinationLines { scales: "1".parse().unwrap(), matches: 1, inliers: &[(0, 1)] };
+        let map = AttentionMap {
+            values: &[1.0; 5],
+            columns: 2,
+            rows: 3,
+        };
+        assert!(matches!(
+            attention_picture(&image, map),
+            Err(DrawError::AttentionShape { values: 5, .. })
+        ));
+        let side = MatchSide {
+            image: &image,
+            attention: None,
+            patches: &patches,
+        };
+        let lines = CombinationLines {
+            scales: "1".parse().unwrap(),
+            matches: 1,
+            inliers: &[(0, 1)],
+        };
         let error = match_picture(&side, &side, &[lines]).unwrap_err();
         assert_eq!(error, DrawError::NoSuchPatch { row: 1, patches: 1 });
-        let empty = RgbImage { size: ImageSize { width: 0, height: 3 }, pixels: vec![] };
-        let side = MatchSide { image: &empty, ..side };
-        assert!(matches!(match_picture(&side, &side, &[]), Err(DrawError::Size(_))));
+        let empty = RgbImage {
+            size: ImageSize {
+                width: 0,
+                height: 3,
+            },
+            pixels: vec![],
+        };
+        let side = MatchSide {
+            image: &empty,
+            ..side
+        };
+        assert!(matches!(
+            match_picture(&side, &side, &[]),
+            Err(DrawError::Size(_))
+        ));
     }
 }

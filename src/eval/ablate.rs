@@ -1,10 +1,11 @@
-//! The axes of the paper's ablation tables as one table: scale combinations, tau, caps, input size, exit block,
-//! backbone, descriptor codec.
+//! The axes of the paper's ablation tables as one table: scale combinations, tau, caps, input size,
+//! exit block, backbone, descriptor codec.
 //!
-//! Heads are bound to one backbone and exit block, so every row searches the mean patch token, which all have. Rows
-//! that differ only after extraction share its result: scale combinations and codecs reuse the features of the base
-//! settings; all rows of tau and of the caps are cut from one extraction that keeps every patch, which gives what a
-//! separate extraction would (key patches come by attention descending, and both rules cut that order off).
+//! Heads are bound to one backbone and exit block, so every row searches the mean patch token,
+//! which all have. Rows that differ only after extraction share its result: scale combinations and
+//! codecs reuse the features of the base settings; all rows of tau and of the caps are cut from one
+//! extraction that keeps every patch, which gives what a separate extraction would (key patches
+//! come by attention descending, and both rules cut that order off).
 
 mod cuts;
 mod full_precision;
@@ -88,7 +89,10 @@ pub fn ablate(
 ) -> Result<Ablation, EvalError> {
     let variants = variants(base)?;
     let bar = progress.add(ProgressBar::new(variants.len() as u64).with_message("settings"));
-    let mut table = Ablation { rows: Vec::new(), left_out: Vec::new() };
+    let mut table = Ablation {
+        rows: Vec::new(),
+        left_out: Vec::new(),
+    };
     // Neighbouring variants share their extraction, so one set of features at a time is enough.
     for group in variants.chunk_by(|a, b| a.extract == b.extract) {
         let features = Prepared::new(dataset, base, &group[0].extract, open, progress)?;
@@ -97,7 +101,9 @@ pub fn ablate(
                 Some(row) => table.rows.push(row),
                 None => {
                     let name = format!("{} {}", variant.axis, variant.setting);
-                    table.left_out.push(format!("{name}: its descriptors need more memory than is allowed"));
+                    table.left_out.push(format!(
+                        "{name}: its descriptors need more memory than is allowed"
+                    ));
                 }
             }
             bar.inc(1);
@@ -129,12 +135,24 @@ impl Prepared {
         let cache = FeatureCache::open(base.cache, &*describer, base.memory_bytes)?;
         let images = (dataset.database.len() + dataset.queries.len()) as u64;
         let bar = progress.add(ProgressBar::new(images).with_message("images"));
-        let side = |items, name| cache.describe_all(&*describer, items, name, GlobalKind::Mean, &bar);
-        let (database, queries) = (side(&dataset.database, "database")?, side(&dataset.queries, "query")?);
+        let side =
+            |items, name| cache.describe_all(&*describer, items, name, GlobalKind::Mean, &bar);
+        let (database, queries) = (
+            side(&dataset.database, "database")?,
+            side(&dataset.queries, "query")?,
+        );
         bar.finish_and_clear();
         let (answers, _) = search_all(&database, &queries, |_| base.candidates);
         let (memory_bytes, components) = (base.memory_bytes, OnceCell::new());
-        Ok(Self { describer, memory_bytes, cache, database, queries, answers, components })
+        Ok(Self {
+            describer,
+            memory_bytes,
+            cache,
+            database,
+            queries,
+            answers,
+            components,
+        })
     }
 
     /// None where a row needs more memory than is allowed.
@@ -144,7 +162,8 @@ impl Prepared {
         variant: &Variant,
         progress: &MultiProgress,
     ) -> Result<Option<AblationRow>, EvalError> {
-        let bar = progress.add(ProgressBar::new(self.answers.len() as u64).with_message(variant.setting.clone()));
+        let bar = progress
+            .add(ProgressBar::new(self.answers.len() as u64).with_message(variant.setting.clone()));
         let (cache, components) = (&self.cache, self.components(variant.cut)?);
         let patches = |features: &Features, index: usize| {
             let whole = cache.patches(features, index)?;
@@ -155,14 +174,31 @@ impl Prepared {
         };
         let (answers, rerank_seconds, patch_bytes) = if variant.cut == Cut::FullPrecision {
             let (describer, bound) = (&*self.describer, self.memory_bytes);
-            match full_precision::rerank_all(describer, dataset, &self.answers, &variant.rerank, bound, &bar)? {
+            match full_precision::rerank_all(
+                describer,
+                dataset,
+                &self.answers,
+                &variant.rerank,
+                bound,
+                &bar,
+            )? {
                 None => return Ok(None),
-                Some(full) => (full.answers, full.seconds, self.database.patch_bytes + full.extra_bytes),
+                Some(full) => (
+                    full.answers,
+                    full.seconds,
+                    self.database.patch_bytes + full.extra_bytes,
+                ),
             }
         } else {
             let answers = self.answers.clone();
-            let (answers, seconds) =
-                rerank_all(&patches, &self.database, &self.queries, answers, &variant.rerank, &bar)?;
+            let (answers, seconds) = rerank_all(
+                &patches,
+                &self.database,
+                &self.queries,
+                answers,
+                &variant.rerank,
+                &bar,
+            )?;
             (answers, seconds.rerank, self.patch_bytes(variant)?)
         };
         bar.finish_and_clear();
@@ -181,12 +217,15 @@ impl Prepared {
 
     /// The components that `cut` needs, from the database's own key patches: no label is looked at.
     fn components(&self, cut: Cut) -> Result<Option<&Components>, EvalError> {
-        let Cut::Codec(Codec::Components(count)) = cut else { return Ok(None) };
+        let Cut::Codec(Codec::Components(count)) = cut else {
+            return Ok(None);
+        };
         if let Some(found) = self.components.get() {
             return Ok(Some(found));
         }
-        let readable: Vec<usize> =
-            (0..self.database.len()).filter(|&index| self.database.global(index).is_some()).collect();
+        let readable: Vec<usize> = (0..self.database.len())
+            .filter(|&index| self.database.global(index).is_some())
+            .collect();
         // Some of every image rather than all of a few.
         let each = SAMPLE.div_ceil(readable.len().max(1));
         let (mut sample, mut dim) = (Vec::new(), 0);
@@ -196,7 +235,10 @@ impl Prepared {
             let step = patches.len().div_ceil(each).max(1);
             sample.extend(unpack(&patches).step_by(step).flatten());
         }
-        Ok(Some(self.components.get_or_init(|| Components::of(&sample, dim, count))))
+        Ok(Some(
+            self.components
+                .get_or_init(|| Components::of(&sample, dim, count)),
+        ))
     }
 
     /// Mean size of what the store would keep.
@@ -208,9 +250,16 @@ impl Prepared {
         };
         let components = self.components(variant.cut)?;
         let (mut bytes, mut images) = (0.0, 0usize);
-        for index in (0..self.database.len()).filter(|&index| self.database.global(index).is_some()) {
-            let patches = apply(&*self.cache.patches(&self.database, index)?, variant.cut, components)?;
-            let encoded = codec::encode(&patches).map_err(|error| EvalError::Setting(error.to_string()))?.len();
+        for index in (0..self.database.len()).filter(|&index| self.database.global(index).is_some())
+        {
+            let patches = apply(
+                &*self.cache.patches(&self.database, index)?,
+                variant.cut,
+                components,
+            )?;
+            let encoded = codec::encode(&patches)
+                .map_err(|error| EvalError::Setting(error.to_string()))?
+                .len();
             bytes += encoded as f64 - patches.codes.len() as f64 * f64::from(8 - bits) / 8.0;
             images += 1;
         }
@@ -218,23 +267,52 @@ impl Prepared {
     }
 }
 
-fn recall(dataset: &Dataset, answers: &[Answer], ranking: fn(&Answer) -> Vec<usize>) -> AtK<Option<f64>> {
+fn recall(
+    dataset: &Dataset,
+    answers: &[Answer],
+    ranking: fn(&Answer) -> Vec<usize>,
+) -> AtK<Option<f64>> {
     let hit = |answer: &Answer| match &dataset.truth[answer.query] {
         Truth::Positives(positives) => Some(first_hit(&ranking(answer), positives)),
         Truth::NoMatch | Truth::Unknown => None,
     };
     let hits: Vec<Option<usize>> = answers.iter().filter_map(hit).collect();
-    RECALL_AT.into_iter().map(|k| (k, recall_at(&hits, k))).collect()
+    RECALL_AT
+        .into_iter()
+        .map(|k| (k, recall_at(&hits, k)))
+        .collect()
 }
 
 /// The paper's table of patch sizes: single scales, joint scales, and sums.
-const SCALE_ROWS: [&str; 12] =
-    ["1", "2", "3", "1+2", "1+3", "2+3", "1+2+3", "1,2,3", "1,1+2", "1,2+3", "1+2,2+3", "1,1+2,2+3"];
+const SCALE_ROWS: [&str; 12] = [
+    "1",
+    "2",
+    "3",
+    "1+2",
+    "1+3",
+    "2+3",
+    "1+2+3",
+    "1,2,3",
+    "1,1+2",
+    "1,2+3",
+    "1+2,2+3",
+    "1,1+2,2+3",
+];
 const TAU_ROWS: [f32; 5] = [0.0, 0.5, 1.0, 1.5, 2.0];
-const CAP_ROWS: [[usize; SCALES]; 5] =
-    [[50, 25, 6], [100, 50, 12], [200, 100, 25], [400, 200, 50], [usize::MAX, usize::MAX, usize::MAX]];
+const CAP_ROWS: [[usize; SCALES]; 5] = [
+    [50, 25, 6],
+    [100, 50, 12],
+    [200, 100, 25],
+    [400, 200, 50],
+    [usize::MAX, usize::MAX, usize::MAX],
+];
 const SIZE_ROWS: [(u32, u32); 4] = [(16, 12), (24, 18), (32, 24), (46, 34)];
-const CODEC_ROWS: [Codec; 4] = [Codec::INT8, Codec::Bits(6), Codec::Bits(4), Codec::Components(128)];
+const CODEC_ROWS: [Codec; 4] = [
+    Codec::INT8,
+    Codec::Bits(6),
+    Codec::Bits(4),
+    Codec::Components(128),
+];
 /// Keeps every patch; as many as an extraction may be asked for.
 const ALL_PATCHES: [usize; SCALES] = [1 << 16; SCALES];
 
@@ -242,35 +320,89 @@ const ALL_PATCHES: [usize; SCALES] = [1 << 16; SCALES];
 fn variants(base: &Base<'_>) -> Result<Vec<Variant>, EvalError> {
     let invalid = |error: crate::types::InvalidValue| EvalError::Setting(error.to_string());
     let extract = base.extract.effective().map_err(invalid)?;
-    let bare = ExtractConfig { head: HeadChoice::None, ..extract.clone() };
-    let mut rows = Rows { rerank: base.rerank, rows: Vec::new() };
+    let bare = ExtractConfig {
+        head: HeadChoice::None,
+        ..extract.clone()
+    };
+    let mut rows = Rows {
+        rerank: base.rerank,
+        rows: Vec::new(),
+    };
     rows.scales(&extract).map_err(invalid)?;
     rows.push("codec", "f32".into(), false, &extract, Cut::FullPrecision);
     for codec in CODEC_ROWS {
-        rows.push("codec", codec.name(), codec == Codec::INT8, &extract, Cut::Codec(codec));
+        rows.push(
+            "codec",
+            codec.name(),
+            codec == Codec::INT8,
+            &extract,
+            Cut::Codec(codec),
+        );
     }
-    let every = ExtractConfig { tau: 0.0, caps: ALL_PATCHES, ..bare.clone() };
+    let every = ExtractConfig {
+        tau: 0.0,
+        caps: ALL_PATCHES,
+        ..bare.clone()
+    };
     for tau in with_base(TAU_ROWS, extract.tau) {
-        let cut = Cut::Limits { tau, caps: extract.caps };
+        let cut = Cut::Limits {
+            tau,
+            caps: extract.caps,
+        };
         rows.push("tau", tau.to_string(), tau == extract.tau, &every, cut);
     }
     for caps in with_base(CAP_ROWS, extract.caps) {
-        let name = if caps[0] == usize::MAX { "none".into() } else { caps.map(|cap| cap.to_string()).join(" / ") };
-        rows.push("caps", name, caps == extract.caps, &every, Cut::Limits { tau: extract.tau, caps });
+        let name = if caps[0] == usize::MAX {
+            "none".into()
+        } else {
+            caps.map(|cap| cap.to_string()).join(" / ")
+        };
+        rows.push(
+            "caps",
+            name,
+            caps == extract.caps,
+            &every,
+            Cut::Limits {
+                tau: extract.tau,
+                caps,
+            },
+        );
     }
     let patch = extract.preset.geometry().patch as u32;
-    let sizes = SIZE_ROWS.map(|(columns, lines)| Some(ImageSize { width: columns * patch, height: lines * patch }));
+    let sizes = SIZE_ROWS.map(|(columns, lines)| {
+        Some(ImageSize {
+            width: columns * patch,
+            height: lines * patch,
+        })
+    });
     for input_size in with_base(sizes, extract.input_size) {
-        let config = ExtractConfig { input_size, ..bare.clone() };
+        let config = ExtractConfig {
+            input_size,
+            ..bare.clone()
+        };
         let name = input_size.map_or_else(|| "preset".to_owned(), |size| size.to_string());
-        rows.push("input size", name, extract.input_size == input_size, &config, Cut::None);
+        rows.push(
+            "input size",
+            name,
+            extract.input_size == input_size,
+            &config,
+            Cut::None,
+        );
     }
     let depth = extract.preset.geometry().depth;
     for exit_block in with_base((depth / 2..depth).map(Some), extract.exit_block) {
         let is_base = extract.exit_block == exit_block;
         // At the base's exit its own attention is looked at, which may be that of another block.
-        let attention_block = if is_base { extract.attention_block } else { exit_block };
-        let config = ExtractConfig { exit_block, attention_block, ..bare.clone() };
+        let attention_block = if is_base {
+            extract.attention_block
+        } else {
+            exit_block
+        };
+        let config = ExtractConfig {
+            exit_block,
+            attention_block,
+            ..bare.clone()
+        };
         let name = exit_block.map_or_else(|| "preset".to_owned(), |block| block.to_string());
         rows.push("exit block", name, is_base, &config, Cut::None);
     }
@@ -283,8 +415,18 @@ fn variants(base: &Base<'_>) -> Result<Vec<Variant>, EvalError> {
             caps: extract.caps,
             ..Default::default()
         };
-        let config = if preset == extract.preset { bare.clone() } else { own.effective().map_err(invalid)? };
-        rows.push("backbone", preset.to_string(), preset == extract.preset, &config, Cut::None);
+        let config = if preset == extract.preset {
+            bare.clone()
+        } else {
+            own.effective().map_err(invalid)?
+        };
+        rows.push(
+            "backbone",
+            preset.to_string(),
+            preset == extract.preset,
+            &config,
+            Cut::None,
+        );
     }
     Ok(rows.rows)
 }
@@ -305,11 +447,28 @@ struct Rows<'a> {
 
 impl Rows<'_> {
     fn scales(&mut self, extract: &ExtractConfig) -> Result<(), crate::types::InvalidValue> {
-        let parse = |text: &str| text.split(',').map(str::parse).collect::<Result<Vec<ScaleSet>, _>>();
-        let settings = SCALE_ROWS.into_iter().map(parse).collect::<Result<Vec<_>, _>>()?;
+        let parse = |text: &str| {
+            text.split(',')
+                .map(str::parse)
+                .collect::<Result<Vec<ScaleSet>, _>>()
+        };
+        let settings = SCALE_ROWS
+            .into_iter()
+            .map(parse)
+            .collect::<Result<Vec<_>, _>>()?;
         for scales in with_base(settings, self.rerank.scales.clone()) {
-            let name = scales.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
-            self.push("scales", name, scales == self.rerank.scales, extract, Cut::None);
+            let name = scales
+                .iter()
+                .map(ToString::to_string)
+                .collect::<Vec<_>>()
+                .join(", ");
+            self.push(
+                "scales",
+                name,
+                scales == self.rerank.scales,
+                extract,
+                Cut::None,
+            );
             if let Some(row) = self.rows.last_mut() {
                 row.rerank.scales = scales;
             }
@@ -317,9 +476,26 @@ impl Rows<'_> {
         Ok(())
     }
 
-    fn push(&mut self, axis: &'static str, setting: String, star: bool, extract: &ExtractConfig, cut: Cut) {
-        let setting = if star { format!("{setting} *") } else { setting };
-        self.rows.push(Variant { axis, setting, extract: extract.clone(), rerank: self.rerank.clone(), cut });
+    fn push(
+        &mut self,
+        axis: &'static str,
+        setting: String,
+        star: bool,
+        extract: &ExtractConfig,
+        cut: Cut,
+    ) {
+        let setting = if star {
+            format!("{setting} *")
+        } else {
+            setting
+        };
+        self.rows.push(Variant {
+            axis,
+            setting,
+            extract: extract.clone(),
+            rerank: self.rerank.clone(),
+            cut,
+        });
     }
 }
 

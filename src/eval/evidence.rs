@@ -1,4 +1,5 @@
-//! Why two images were found to match, or not: everything the picture of a match needs, computed anew for one pair.
+//! Why two images were found to match, or not: everything the picture of a match needs, computed
+//! anew for one pair.
 
 use super::EvalError;
 use crate::draw::{AttentionMap, CombinationLines, MatchSide, match_picture};
@@ -21,7 +22,11 @@ pub struct Seen {
 
 impl Seen {
     /// Runs the model on one image and keeps what a picture needs.
-    pub fn new(extractor: &Extractor, limits: &ImageConfig, bytes: &[u8]) -> Result<Self, EvalError> {
+    pub fn new(
+        extractor: &Extractor,
+        limits: &ImageConfig,
+        bytes: &[u8],
+    ) -> Result<Self, EvalError> {
         let trace = extractor.trace(&load_tensor(bytes, limits, extractor.input_size())?)?;
         Ok(Self {
             image: decode(bytes, limits)?,
@@ -34,13 +39,25 @@ impl Seen {
     fn side(&self) -> MatchSide<'_> {
         let grid = self.patches.grid;
         let (columns, rows) = (usize::from(grid.columns), usize::from(grid.rows));
-        let attention = Some(AttentionMap { values: &self.attention, columns, rows });
-        MatchSide { image: &self.image, attention, patches: &self.patches }
+        let attention = Some(AttentionMap {
+            values: &self.attention,
+            columns,
+            rows,
+        });
+        MatchSide {
+            image: &self.image,
+            attention,
+            patches: &self.patches,
+        }
     }
 }
 
 /// Both images side by side with attention and key patches, and the inliers of every combination.
-pub fn picture(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) -> Result<RgbImage, EvalError> {
+pub fn picture(
+    query: &Seen,
+    reference: &Seen,
+    matches: &[CombinationMatch],
+) -> Result<RgbImage, EvalError> {
     let inliers = |found: &CombinationMatch| -> Vec<(u32, u32)> {
         let inliers = found.correspondences.iter().filter(|pair| pair.inlier);
         inliers.map(|pair| (pair.query, pair.reference)).collect()

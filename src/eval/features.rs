@@ -1,17 +1,21 @@
-//! Descriptors of a whole data set, kept on disk so that an interrupted run resumes and a second one starts at once.
+//! Descriptors of a whole data set, kept on disk so that an interrupted run resumes and a second
+//! one starts at once.
 //!
-//! A record is found by the model's identity, what a fixed picture gives on this machine, and the hash of the image's
-//! content: renaming or copying images costs nothing, changing one image, one setting or one rounding of a kernel
-//! recomputes just what it must. Records are written beside their place and renamed into it, and carry a checksum: a
-//! half-written or damaged one is as good as none. An image that cannot be read is listed with its reason and takes no
-//! part; it never vanishes in silence.
+//! A record is found by the model's identity, what a fixed picture gives on this machine, and the
+//! hash of the image's content: renaming or copying images costs nothing, changing one image, one
+//! setting or one rounding of a kernel recomputes just what it must. Records are written beside
+//! their place and renamed into it, and carry a checksum: a half-written or damaged one is as good
+//! as none. An image that cannot be read is listed with its reason and takes no part; it never
+//! vanishes in silence.
 
 use super::EvalError;
 use super::datasets::Item;
 use crate::extract::Extractor;
 use crate::image::{ImageConfig, RgbImage, encode_jpeg, load_tensor};
 use crate::store::codec;
-use crate::types::{ContentHash, Descriptor, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches};
+use crate::types::{
+    ContentHash, Descriptor, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches,
+};
 use indicatif::ProgressBar;
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
@@ -27,8 +31,9 @@ pub trait Describe: Sync {
     fn model(&self) -> &ModelId;
     /// The name of what computes them, for people.
     fn computed_by(&self) -> String;
-    /// A hash of what a fixed picture gives, from its bytes on. Descriptors of one model compare whatever computed
-    /// them, but a measurement must not mix those of two builds whose kernels, decoder or resizing differ.
+    /// A hash of what a fixed picture gives, from its bytes on. Descriptors of one model compare
+    /// whatever computed them, but a measurement must not mix those of two builds whose kernels,
+    /// decoder or resizing differ.
     fn fingerprint(&self) -> Result<ContentHash, EvalError>;
     /// Decodes and normalises; the error says what is wrong with the image.
     fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String>;
@@ -56,17 +61,26 @@ impl Describe for ModelDescriber {
     }
 
     fn fingerprint(&self) -> Result<ContentHash, EvalError> {
-        let setting = |error: String| EvalError::Setting(format!("the picture that tells builds apart: {error}"));
+        let setting = |error: String| {
+            EvalError::Setting(format!("the picture that tells builds apart: {error}"))
+        };
         let picture = encode_jpeg(&probe_picture(self.extractor.input_size()), 90);
         let bytes = picture.map_err(|error| setting(error.to_string()))?;
-        let descriptor = self.describe(&[self.tensor(&bytes).map_err(setting)?])?.pop();
+        let descriptor = self
+            .describe(&[self.tensor(&bytes).map_err(setting)?])?
+            .pop();
         let descriptor = descriptor.ok_or_else(|| setting("no descriptor".into()))?;
-        let mut untimed = Record { seconds: ExtractionSeconds::default(), blob_bytes: 0, descriptor };
+        let mut untimed = Record {
+            seconds: ExtractionSeconds::default(),
+            blob_bytes: 0,
+            descriptor,
+        };
         Ok(ContentHash::of(&untimed.encode()?))
     }
 
     fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String> {
-        load_tensor(bytes, &self.limits, self.extractor.input_size()).map_err(|error| error.to_string())
+        load_tensor(bytes, &self.limits, self.extractor.input_size())
+            .map_err(|error| error.to_string())
     }
 
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, EvalError> {
@@ -74,17 +88,29 @@ impl Describe for ModelDescriber {
     }
 
     fn key_patches(&self, image: &ImageTensor) -> Result<KeyPatches, EvalError> {
-        let described = self.extractor.extract_full(std::slice::from_ref(image))?.pop();
-        described.map(|(_, patches)| patches).ok_or_else(|| EvalError::Setting("one image gave no descriptor".into()))
+        let described = self
+            .extractor
+            .extract_full(std::slice::from_ref(image))?
+            .pop();
+        described
+            .map(|(_, patches)| patches)
+            .ok_or_else(|| EvalError::Setting("one image gave no descriptor".into()))
     }
 }
 
-/// Waves and steps of all three colours, half as large again as the model's input so that it is resized.
+/// Waves and steps of all three colours, half as large again as the model's input so that it is
+/// resized.
 fn probe_picture(input: ImageSize) -> RgbImage {
-    let size = ImageSize { width: input.width * 3 / 2, height: input.height * 3 / 2 };
-    let pixel =
-        |x: u32, y: u32| [x * 7 + y, (x / 24 * 50) ^ (y / 40 * 90), x * y / 64].map(|value| (value % 256) as u8);
-    let pixels = (0..size.height).flat_map(|y| (0..size.width).flat_map(move |x| pixel(x, y))).collect();
+    let size = ImageSize {
+        width: input.width * 3 / 2,
+        height: input.height * 3 / 2,
+    };
+    let pixel = |x: u32, y: u32| {
+        [x * 7 + y, (x / 24 * 50) ^ (y / 40 * 90), x * y / 64].map(|value| (value % 256) as u8)
+    };
+    let pixels = (0..size.height)
+        .flat_map(|y| (0..size.width).flat_map(move |x| pixel(x, y)))
+        .collect();
     RgbImage { size, pixels }
 }
 
@@ -118,7 +144,8 @@ pub struct ExtractionSeconds {
     pub extract: f64,
 }
 
-/// Descriptors of one side of a data set: global vectors in memory, key patches on disk behind a cache.
+/// Descriptors of one side of a data set: global vectors in memory, key patches on disk behind a
+/// cache.
 pub struct Features {
     /// Length of a global vector.
     pub dim: usize,
@@ -141,7 +168,10 @@ pub struct Features {
 impl Features {
     #[cfg(test)]
     pub(super) fn empty_for_tests(n: usize) -> Self {
-        let all = Collected { records: vec![None; n], ..Default::default() };
+        let all = Collected {
+            records: vec![None; n],
+            ..Default::default()
+        };
         all.finish(n).unwrap()
     }
 
@@ -181,15 +211,28 @@ const CHUNK: usize = 32;
 const BATCH: usize = 4;
 
 impl FeatureCache {
-    /// Opens (and creates) what `describer` recorded below `root`, holding at most `memory_bytes` of key patches.
-    pub fn open(root: &Path, describer: &dyn Describe, memory_bytes: u64) -> Result<Self, EvalError> {
-        let identity = format!("{} {} {}", describer.model(), describer.computed_by(), describer.fingerprint()?);
+    /// Opens (and creates) what `describer` recorded below `root`, holding at most `memory_bytes`
+    /// of key patches.
+    pub fn open(
+        root: &Path,
+        describer: &dyn Describe,
+        memory_bytes: u64,
+    ) -> Result<Self, EvalError> {
+        let identity = format!(
+            "{} {} {}",
+            describer.model(),
+            describer.computed_by(),
+            describer.fingerprint()?
+        );
         let name = ContentHash::of(identity.as_bytes()).to_string();
         let folder = root.join(&name[..16]);
         std::fs::create_dir_all(&folder).map_err(EvalError::io(&folder))?;
         let note = folder.join("model.txt");
         std::fs::write(&note, identity).map_err(EvalError::io(&note))?;
-        Ok(Self { folder, memory: Cache::with_weighter(4096, memory_bytes, PatchBytes) })
+        Ok(Self {
+            folder,
+            memory: Cache::with_weighter(4096, memory_bytes, PatchBytes),
+        })
     }
 
     /// Describes `items`, taking from disk what is there.
@@ -203,8 +246,10 @@ impl FeatureCache {
     ) -> Result<Features, EvalError> {
         let mut all = Collected::default();
         for chunk in items.chunks(CHUNK) {
-            let mut found: Vec<Result<Loaded, String>> =
-                chunk.par_iter().map(|item| self.find(describer, item)).collect();
+            let mut found: Vec<Result<Loaded, String>> = chunk
+                .par_iter()
+                .map(|item| self.find(describer, item))
+                .collect();
             self.describe_missing(describer, &mut found, &mut all.fresh)?;
             for (item, result) in chunk.iter().zip(found) {
                 all.add(item, side, kind, result)?;
@@ -215,14 +260,26 @@ impl FeatureCache {
     }
 
     /// Key patches of image `index` of a side this cache described.
-    pub fn patches(&self, features: &Features, index: usize) -> Result<Arc<PackedPatches>, EvalError> {
+    pub fn patches(
+        &self,
+        features: &Features,
+        index: usize,
+    ) -> Result<Arc<PackedPatches>, EvalError> {
         let missing = |hash: &ContentHash| {
-            let source =
-                std::io::Error::new(std::io::ErrorKind::NotFound, "the record vanished or was damaged during the run");
-            EvalError::Io { path: self.path(hash), source }
+            let source = std::io::Error::new(
+                std::io::ErrorKind::NotFound,
+                "the record vanished or was damaged during the run",
+            );
+            EvalError::Io {
+                path: self.path(hash),
+                source,
+            }
         };
-        let hash = features.records[index]
-            .ok_or_else(|| EvalError::Setting(format!("image {index} was unreadable and has no key patches")))?;
+        let hash = features.records[index].ok_or_else(|| {
+            EvalError::Setting(format!(
+                "image {index} was unreadable and has no key patches"
+            ))
+        })?;
         self.memory.get_or_insert_with(&hash, || {
             let record = self.read(&hash).ok_or_else(|| missing(&hash))?;
             Ok(Arc::new(record.descriptor.patches))
@@ -246,7 +303,9 @@ impl FeatureCache {
         found: &mut [Result<Loaded, String>],
         fresh: &mut usize,
     ) -> Result<(), EvalError> {
-        let missing: Vec<usize> = (0..found.len()).filter(|&i| matches!(found[i], Ok(Loaded::Decoded(..)))).collect();
+        let missing: Vec<usize> = (0..found.len())
+            .filter(|&i| matches!(found[i], Ok(Loaded::Decoded(..))))
+            .collect();
         for batch in missing.chunks(BATCH) {
             let (mut slots, mut tensors) = (Vec::new(), Vec::new());
             for &index in batch {
@@ -261,7 +320,11 @@ impl FeatureCache {
             let descriptors = describer.describe(&tensors)?;
             let extract = start.elapsed().as_secs_f64() / tensors.len() as f64;
             for ((index, hash, decode), descriptor) in slots.into_iter().zip(descriptors) {
-                let record = Record { seconds: ExtractionSeconds { decode, extract }, blob_bytes: 0, descriptor };
+                let record = Record {
+                    seconds: ExtractionSeconds { decode, extract },
+                    blob_bytes: 0,
+                    descriptor,
+                };
                 found[index] = Ok(Loaded::Done(hash, Box::new(self.write(&hash, record)?)));
                 *fresh += 1;
             }
@@ -271,7 +334,9 @@ impl FeatureCache {
 
     fn path(&self, hash: &ContentHash) -> PathBuf {
         let name = hash.to_string();
-        self.folder.join(&name[..2]).join(format!("{name}.features"))
+        self.folder
+            .join(&name[..2])
+            .join(format!("{name}.features"))
     }
 
     /// The record, if it is there and whole.
@@ -325,9 +390,17 @@ impl Collected {
     ) -> Result<(), EvalError> {
         let (hash, record) = match result {
             Ok(Loaded::Done(hash, record)) => (hash, record),
-            Ok(Loaded::Decoded(..)) => return Err(EvalError::Setting("a decoded image was left undescribed".into())),
+            Ok(Loaded::Decoded(..)) => {
+                return Err(EvalError::Setting(
+                    "a decoded image was left undescribed".into(),
+                ));
+            }
             Err(reason) => {
-                self.unreadable.push(Unreadable { name: item.name.clone(), side, reason });
+                self.unreadable.push(Unreadable {
+                    name: item.name.clone(),
+                    side,
+                    reason,
+                });
                 self.records.push(None);
                 self.globals.resize(self.records.len() * self.dim, 0.0);
                 return Ok(());
@@ -338,7 +411,8 @@ impl Collected {
             GlobalKind::Mean => record.descriptor.pooled.clone(),
         };
         if self.dim == 0 {
-            // Unreadable images may have come first: their rows are made up for now that the length is known.
+            // Unreadable images may have come first: their rows are made up for now that the length
+            // is known.
             self.dim = vector.len();
             self.globals.resize(self.records.len() * self.dim, 0.0);
         }
@@ -361,7 +435,10 @@ impl Collected {
             patch_bytes: self.blob_bytes as f64 / readable,
             pooled_dim: self.pooled_dim,
             unreadable: self.unreadable,
-            seconds: ExtractionSeconds { decode: self.decode / readable, extract: self.extract / readable },
+            seconds: ExtractionSeconds {
+                decode: self.decode / readable,
+                extract: self.extract / readable,
+            },
             fresh: self.fresh,
         })
     }
@@ -380,9 +457,11 @@ const MAGIC: &[u8; 8] = b"PFFEAT01";
 const HEADER: usize = 8 + 2 * 8 + 2 * 4;
 
 impl Record {
-    /// Magic, seconds, lengths, global and pooled vectors, key patches as the store encodes them, CRC-32 of it all.
+    /// Magic, seconds, lengths, global and pooled vectors, key patches as the store encodes them,
+    /// CRC-32 of it all.
     fn encode(&mut self) -> Result<Vec<u8>, EvalError> {
-        let blob = codec::encode(&self.descriptor.patches).map_err(|error| EvalError::Setting(error.to_string()))?;
+        let blob = codec::encode(&self.descriptor.patches)
+            .map_err(|error| EvalError::Setting(error.to_string()))?;
         self.blob_bytes = blob.len();
         let mut bytes = MAGIC.to_vec();
         bytes.extend(self.seconds.decode.to_le_bytes());
@@ -400,17 +479,29 @@ impl Record {
     /// None unless every byte is as it was written.
     fn decode(bytes: &[u8]) -> Option<Self> {
         let (content, checksum) = bytes.split_last_chunk::<4>()?;
-        if crc32fast::hash(content) != u32::from_le_bytes(*checksum) || !content.starts_with(MAGIC) {
+        if crc32fast::hash(content) != u32::from_le_bytes(*checksum) || !content.starts_with(MAGIC)
+        {
             return None;
         }
-        let number = |at: usize| Some(f64::from_le_bytes(content.get(at..at + 8)?.try_into().ok()?));
-        let length = |at: usize| Some(u32::from_le_bytes(content.get(at..at + 4)?.try_into().ok()?) as usize);
+        let number = |at: usize| {
+            Some(f64::from_le_bytes(
+                content.get(at..at + 8)?.try_into().ok()?,
+            ))
+        };
+        let length = |at: usize| {
+            Some(u32::from_le_bytes(content.get(at..at + 4)?.try_into().ok()?) as usize)
+        };
         let (global, pooled) = (length(24)?, length(28)?);
         let vectors = content.get(HEADER..HEADER.checked_add(4 * global.checked_add(pooled)?)?)?;
-        let mut values = vectors.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+        let mut values = vectors
+            .chunks_exact(4)
+            .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
         let blob = content.get(HEADER + vectors.len()..)?;
         Some(Self {
-            seconds: ExtractionSeconds { decode: number(8)?, extract: number(16)? },
+            seconds: ExtractionSeconds {
+                decode: number(8)?,
+                extract: number(16)?,
+            },
             blob_bytes: blob.len(),
             descriptor: Descriptor {
                 global: values.by_ref().take(global).collect(),

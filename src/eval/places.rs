@@ -1,4 +1,5 @@
-//! Which queries show the same place, so that what is learnt from one is not tested on its neighbour.
+//! Which queries show the same place, so that what is learnt from one is not tested on its
+//! neighbour.
 
 use super::datasets::{Dataset, NeighbourGrid, Truth};
 use super::measure::FOLDS;
@@ -7,39 +8,56 @@ use std::collections::BTreeMap;
 /// Queries without a match that stand this near to each other show one place.
 const PLACE_M: f64 = 25.0;
 
-/// For every query the number of its place: queries that share a positive, directly or by others between them, have the
-/// same; of those without a match, queries that stand together.
+/// For every query the number of its place: queries that share a positive, directly or by others
+/// between them, have the same; of those without a match, queries that stand together.
 ///
-/// Where frames are dense a whole drive hangs together like this. A place of more than half of all queries is therefore
-/// cut into as many stretches as there are folds, in the order of the database.
+/// Where frames are dense a whole drive hangs together like this. A place of more than half of all
+/// queries is therefore cut into as many stretches as there are folds, in the order of the
+/// database.
 pub(super) fn places_of(dataset: &Dataset) -> Vec<usize> {
     let references = dataset.database.len();
     let mut sets = Sets::new(references + dataset.queries.len());
     for (query, truth) in dataset.truth.iter().enumerate() {
-        truth.positives().iter().for_each(|&positive| sets.join(references + query, positive));
+        truth
+            .positives()
+            .iter()
+            .for_each(|&positive| sets.join(references + query, positive));
     }
-    let unmatched = dataset.queries.iter().enumerate().filter_map(|(query, item)| {
-        (dataset.truth[query] == Truth::NoMatch).then_some(())?;
-        Some((query, item.position?))
-    });
+    let unmatched = dataset
+        .queries
+        .iter()
+        .enumerate()
+        .filter_map(|(query, item)| {
+            (dataset.truth[query] == Truth::NoMatch).then_some(())?;
+            Some((query, item.position?))
+        });
     let unmatched: Vec<_> = unmatched.collect();
     let grid = NeighbourGrid::new(PLACE_M, unmatched.iter().copied());
     for &(query, position) in &unmatched {
-        for other in grid.within(position).filter(|&other| dataset.queries[other].group == dataset.queries[query].group)
+        for other in grid
+            .within(position)
+            .filter(|&other| dataset.queries[other].group == dataset.queries[query].group)
         {
             sets.join(references + query, references + other);
         }
     }
     let mut members: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for query in 0..dataset.queries.len() {
-        members.entry(sets.root(references + query)).or_default().push(query);
+        members
+            .entry(sets.root(references + query))
+            .or_default()
+            .push(query);
     }
     let mut places = vec![0; dataset.queries.len()];
     let mut next = 0;
     for mut queries in members.into_values() {
         queries.sort_by_key(|&query| (dataset.truth[query].positives().first().copied(), query));
         let is_chain = 2 * queries.len() > dataset.queries.len();
-        let stretch = if is_chain { queries.len().div_ceil(FOLDS) } else { queries.len() };
+        let stretch = if is_chain {
+            queries.len().div_ceil(FOLDS)
+        } else {
+            queries.len()
+        };
         for together in queries.chunks(stretch.max(1)) {
             together.iter().for_each(|&query| places[query] = next);
             next += 1;
@@ -79,7 +97,14 @@ mod tests {
     fn dataset(truth: Vec<Truth>) -> Dataset {
         let items = |n: usize| (0..n).map(|i| Item::new(i.to_string(), "x")).collect();
         let (queries, skipped, notes) = (items(truth.len()), Vec::new(), Vec::new());
-        Dataset { name: "d".into(), database: items(40), queries, truth, skipped, notes }
+        Dataset {
+            name: "d".into(),
+            database: items(40),
+            queries,
+            truth,
+            skipped,
+            notes,
+        }
     }
 
     fn positives(indices: &[usize]) -> Truth {
@@ -105,7 +130,13 @@ mod tests {
 
     #[test]
     fn unmatched_queries_that_stand_together_are_one_place() {
-        let mut set = dataset(vec![Truth::NoMatch, Truth::NoMatch, Truth::NoMatch, positives(&[1]), positives(&[9])]);
+        let mut set = dataset(vec![
+            Truth::NoMatch,
+            Truth::NoMatch,
+            Truth::NoMatch,
+            positives(&[1]),
+            positives(&[9]),
+        ]);
         for (query, east) in [0.0, 20.0, 500.0, 0.0].into_iter().enumerate() {
             set.queries[query].position = Some(MetricPoint { east, north: 0.0 });
         }
@@ -117,9 +148,14 @@ mod tests {
     #[test]
     fn a_drive_that_hangs_together_is_cut_into_stretches() {
         // Asked in reverse: stretches follow the database.
-        let places = places_of(&dataset((0..30).rev().map(|i| positives(&[i, i + 1])).collect()));
+        let places = places_of(&dataset(
+            (0..30).rev().map(|i| positives(&[i, i + 1])).collect(),
+        ));
         let distinct: std::collections::BTreeSet<_> = places.iter().collect();
         assert_eq!(distinct.len(), FOLDS);
-        assert_eq!(places.windows(2).filter(|pair| pair[0] != pair[1]).count(), FOLDS - 1);
+        assert_eq!(
+            places.windows(2).filter(|pair| pair[0] != pair[1]).count(),
+            FOLDS - 1
+        );
     }
 }

@@ -45,12 +45,18 @@ pub struct Answer {
 impl Answer {
     /// Database indices by global distance.
     pub fn global_ranking(&self) -> Vec<usize> {
-        self.global.iter().map(|neighbour| neighbour.index).collect()
+        self.global
+            .iter()
+            .map(|neighbour| neighbour.index)
+            .collect()
     }
 
     /// Database indices by S.
     pub fn reranked_ranking(&self) -> Vec<usize> {
-        self.reranked.iter().map(|candidate| candidate.index).collect()
+        self.reranked
+            .iter()
+            .map(|candidate| candidate.index)
+            .collect()
     }
 }
 
@@ -65,14 +71,22 @@ pub struct QuerySeconds {
     pub rerank: f64,
 }
 
-/// The nearest database images of every readable query, as many as `candidates` says for it; the second value is the
-/// mean seconds per query.
-pub fn search_all(database: &Features, queries: &Features, candidates: impl Fn(usize) -> usize) -> (Vec<Answer>, f64) {
+/// The nearest database images of every readable query, as many as `candidates` says for it; the
+/// second value is the mean seconds per query.
+pub fn search_all(
+    database: &Features,
+    queries: &Features,
+    candidates: impl Fn(usize) -> usize,
+) -> (Vec<Answer>, f64) {
     let searcher = Searcher::new(database);
     let start = Instant::now();
     let answer = |query: usize| {
         let global = searcher.search(queries.global(query)?, candidates(query));
-        Some(Answer { query, global, reranked: Vec::new() })
+        Some(Answer {
+            query,
+            global,
+            reranked: Vec::new(),
+        })
     };
     let answers: Vec<Answer> = (0..queries.len()).filter_map(answer).collect();
     let seconds = start.elapsed().as_secs_f64() / answers.len().max(1) as f64;
@@ -80,9 +94,11 @@ pub fn search_all(database: &Features, queries: &Features, candidates: impl Fn(u
 }
 
 /// Where key patches come from: the cache as it is, or what an ablation makes of it.
-pub type LoadPatches<'a> = dyn Fn(&Features, usize) -> Result<Arc<PackedPatches>, EvalError> + Sync + 'a;
+pub type LoadPatches<'a> =
+    dyn Fn(&Features, usize) -> Result<Arc<PackedPatches>, EvalError> + Sync + 'a;
 
-/// Re-ranks the candidates of every answer; the second value is the mean seconds per query (load, rerank).
+/// Re-ranks the candidates of every answer; the second value is the mean seconds per query (load,
+/// rerank).
 pub fn rerank_all(
     patches: &LoadPatches<'_>,
     database: &Features,
@@ -97,10 +113,19 @@ pub fn rerank_all(
         let start = Instant::now();
         let query = patches(queries, answer.query)?;
         let load = |neighbour: &Neighbour| patches(database, neighbour.index);
-        let candidates: Vec<_> = answer.global.par_iter().map(load).collect::<Result<_, _>>()?;
+        let candidates: Vec<_> = answer
+            .global
+            .par_iter()
+            .map(load)
+            .collect::<Result<_, _>>()?;
         seconds.load += start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let outcome = reranker.rerank(&query, candidates.len(), |i| Ok::<_, EvalError>(candidates[i].clone()), None);
+        let outcome = reranker.rerank(
+            &query,
+            candidates.len(),
+            |i| Ok::<_, EvalError>(candidates[i].clone()),
+            None,
+        );
         seconds.rerank += start.elapsed().as_secs_f64();
         match outcome {
             Reranked::Complete { ranked, mut failed } => {
@@ -109,18 +134,31 @@ pub fn rerank_all(
                 }
                 let candidate = |ranked: crate::rerank::Ranked| {
                     let Neighbour { index, distance } = answer.global[ranked.candidate];
-                    Candidate { index, distance, score: ranked.score }
+                    Candidate {
+                        index,
+                        distance,
+                        score: ranked.score,
+                    }
                 };
                 answer.reranked = ranked.into_iter().map(candidate).collect();
             }
             Reranked::DeadlinePassed => {
-                return Err(EvalError::Setting("re-ranking stopped at a deadline though none was set".into()));
+                return Err(EvalError::Setting(
+                    "re-ranking stopped at a deadline though none was set".into(),
+                ));
             }
         }
         progress.inc(1);
     }
     let count = answers.len().max(1) as f64;
-    Ok((answers, QuerySeconds { load: seconds.load / count, rerank: seconds.rerank / count, ..seconds }))
+    Ok((
+        answers,
+        QuerySeconds {
+            load: seconds.load / count,
+            rerank: seconds.rerank / count,
+            ..seconds
+        },
+    ))
 }
 
 /// Exact search over global vectors: the service's index at its length, else a plain scan.
@@ -136,16 +174,29 @@ impl<'f> Searcher<'f> {
         }
         let entry = |index: usize| {
             let global = database.global(index)?.to_vec();
-            Some(IndexEntry { id: id_of(index), global, location: None, captured_at: None })
+            Some(IndexEntry {
+                id: id_of(index),
+                global,
+                location: None,
+                captured_at: None,
+            })
         };
-        Self::Index(Box::new(MapIndex::build((0..database.len()).filter_map(entry).collect())))
+        Self::Index(Box::new(MapIndex::build(
+            (0..database.len()).filter_map(entry).collect(),
+        )))
     }
 
     fn search(&self, query: &[f32], k: usize) -> Vec<Neighbour> {
         match self {
             Self::Index(index) => {
                 let found = index.search(query, k, &ReferenceFilter::default());
-                found.into_iter().map(|n| Neighbour { index: index_of(n.id), distance: n.distance }).collect()
+                found
+                    .into_iter()
+                    .map(|n| Neighbour {
+                        index: index_of(n.id),
+                        distance: n.distance,
+                    })
+                    .collect()
             }
             Self::Scan(database) => scan(database, query, k),
         }
@@ -164,11 +215,25 @@ fn index_of(id: ReferenceId) -> usize {
 fn scan(database: &Features, query: &[f32], k: usize) -> Vec<Neighbour> {
     let distance = |index: usize| {
         let vector = database.global(index)?;
-        let squared: f32 = vector.iter().zip(query).map(|(a, b)| (a - b) * (a - b)).sum();
-        Some(Neighbour { index, distance: squared.sqrt() })
+        let squared: f32 = vector
+            .iter()
+            .zip(query)
+            .map(|(a, b)| (a - b) * (a - b))
+            .sum();
+        Some(Neighbour {
+            index,
+            distance: squared.sqrt(),
+        })
     };
-    let mut all: Vec<Neighbour> = (0..database.len()).into_par_iter().filter_map(distance).collect();
-    let order = |a: &Neighbour, b: &Neighbour| a.distance.total_cmp(&b.distance).then(a.index.cmp(&b.index));
+    let mut all: Vec<Neighbour> = (0..database.len())
+        .into_par_iter()
+        .filter_map(distance)
+        .collect();
+    let order = |a: &Neighbour, b: &Neighbour| {
+        a.distance
+            .total_cmp(&b.distance)
+            .then(a.index.cmp(&b.index))
+    };
     if k < all.len() {
         all.select_nth_unstable_by(k, order);
         all.truncate(k);

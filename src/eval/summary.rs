@@ -24,7 +24,10 @@ pub struct Both<T> {
 
 impl<T> Both<T> {
     fn of(reranked: bool, mut value: impl FnMut(Stage) -> T) -> Self {
-        Self { global: value(Stage::Global), reranked: reranked.then(|| value(Stage::Reranked)) }
+        Self {
+            global: value(Stage::Global),
+            reranked: reranked.then(|| value(Stage::Reranked)),
+        }
     }
 }
 
@@ -141,8 +144,8 @@ pub struct Summary {
     /// Probability of being right from S and distance; absent if answers of both kinds are too few.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub calibration: Option<CalibrationSummary>,
-    /// What the calibration that the program carries for this model comes to on these queries, after re-ranking if
-    /// that was done; absent if it carries none.
+    /// What the calibration that the program carries for this model comes to on these queries,
+    /// after re-ranking if that was done; absent if it carries none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub shipped_calibration: Option<Applied>,
     /// The same of a calibration that was given to be judged.
@@ -166,7 +169,8 @@ pub struct Summary {
     pub notes: Vec<String>,
 }
 
-/// What became of one query; ranks begin at 1 and are absent where no positive was among the candidates.
+/// What became of one query; ranks begin at 1 and are absent where no positive was among the
+/// candidates.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Outcome {
     /// Name of the query.
@@ -198,7 +202,8 @@ const CALIBRATION_MINIMUM: usize = 5;
 pub struct Asked<'a> {
     /// The answers to the data set as it is.
     pub answers: &'a [Answer],
-    /// Answers to the same queries with their own place left out of the database: none of them can be right.
+    /// Answers to the same queries with their own place left out of the database: none of them can
+    /// be right.
     pub left_out: &'a [Answer],
     /// Mean seconds per query.
     pub seconds: QuerySeconds,
@@ -213,10 +218,21 @@ pub fn summarise(
     config: RunConfig,
     given: Option<&Calibration>,
 ) -> Result<Summary, EvalError> {
-    let Asked { answers, left_out, seconds } = asked;
-    let view = View { dataset, reranked: config.rerank.is_some() };
+    let Asked {
+        answers,
+        left_out,
+        seconds,
+    } = asked;
+    let view = View {
+        dataset,
+        reranked: config.rerank.is_some(),
+    };
     let all: Vec<&Answer> = answers.iter().collect();
-    let judged: Vec<&Answer> = all.iter().copied().filter(|a| dataset.truth[a.query] != Truth::Unknown).collect();
+    let judged: Vec<&Answer> = all
+        .iter()
+        .copied()
+        .filter(|a| dataset.truth[a.query] != Truth::Unknown)
+        .collect();
     let with_match = view.with_match(&all);
     let best = BestAnswers::of(dataset, answers, left_out);
     let mut unreadable = database.unreadable.clone();
@@ -240,13 +256,18 @@ pub fn summarise(
         database: dataset.database.len() - database.unreadable.len(),
         recall: Both::of(view.reranked, |stage| view.recall(&with_match, stage)),
         recall_interval: Both::of(view.reranked, interval),
-        map: Both::of(view.reranked, |stage| view.mean_average_precision(&with_match, stage)),
-        rejection: Both::of(view.reranked, |stage| measure::rejection(&view.judged(&judged, left_out, stage))),
+        map: Both::of(view.reranked, |stage| {
+            view.mean_average_precision(&with_match, stage)
+        }),
+        rejection: Both::of(view.reranked, |stage| {
+            measure::rejection(&view.judged(&judged, left_out, stage))
+        }),
         poses: view.poses(&all),
         groups: view.groups(&all),
         calibration: fitted_here(&best, config.seed),
         shipped_calibration: shipped_here(&best, &config),
-        given_calibration: given.and_then(|given| given_here(&best, given, config.rerank.is_some())),
+        given_calibration: given
+            .and_then(|given| given_here(&best, given, config.rerank.is_some())),
         seconds: Seconds {
             decode: database.seconds.decode,
             extract: database.seconds.extract,
@@ -283,23 +304,35 @@ impl<'a> View<'a> {
     }
 
     fn with_match<'b>(&self, answers: &[&'b Answer]) -> Vec<&'b Answer> {
-        answers.iter().copied().filter(|answer| !self.positives(answer).is_empty()).collect()
+        answers
+            .iter()
+            .copied()
+            .filter(|answer| !self.positives(answer).is_empty())
+            .collect()
     }
 
     fn hits(&self, with_match: &[&Answer], stage: Stage) -> Vec<Option<usize>> {
-        with_match.iter().map(|answer| measure::first_hit(&ranking(answer, stage), self.positives(answer))).collect()
+        with_match
+            .iter()
+            .map(|answer| measure::first_hit(&ranking(answer, stage), self.positives(answer)))
+            .collect()
     }
 
     fn recall(&self, with_match: &[&Answer], stage: Stage) -> AtK<Option<f64>> {
         let hits = self.hits(with_match, stage);
-        RECALL_AT.into_iter().map(|k| (k, measure::recall_at(&hits, k))).collect()
+        RECALL_AT
+            .into_iter()
+            .map(|k| (k, measure::recall_at(&hits, k)))
+            .collect()
     }
 
     fn mean_average_precision(&self, with_match: &[&Answer], stage: Stage) -> AtK<f64> {
         let mean = |k| {
             let sum: f64 = with_match
                 .iter()
-                .map(|answer| measure::average_precision(&ranking(answer, stage), self.positives(answer), k))
+                .map(|answer| {
+                    measure::average_precision(&ranking(answer, stage), self.positives(answer), k)
+                })
                 .sum();
             sum / with_match.len().max(1) as f64
         };
@@ -312,7 +345,10 @@ impl<'a> View<'a> {
         let (global, reranked) = (rank(Stage::Global), rank(Stage::Reranked));
         let best = match answer.reranked.first() {
             Some(candidate) => Some((candidate.index, candidate.distance)),
-            None => answer.global.first().map(|neighbour| (neighbour.index, neighbour.distance)),
+            None => answer
+                .global
+                .first()
+                .map(|neighbour| (neighbour.index, neighbour.distance)),
         };
         Outcome {
             query: self.dataset.queries[answer.query].name.clone(),
@@ -321,7 +357,10 @@ impl<'a> View<'a> {
             reranked_rank: reranked.map(|rank| rank + 1),
             best: best.map(|(index, _)| self.dataset.database[index].name.clone()),
             global_distance: best.map(|(_, distance)| distance),
-            spatial_score: answer.reranked.first().map(|candidate| candidate.score.spatial_score),
+            spatial_score: answer
+                .reranked
+                .first()
+                .map(|candidate| candidate.score.spatial_score),
             positive_score: reranked.map(|rank| answer.reranked[rank].score.spatial_score),
         }
     }
@@ -329,22 +368,41 @@ impl<'a> View<'a> {
     fn judged(&self, answers: &[&Answer], left_out: &[Answer], stage: Stage) -> Vec<Judged> {
         let judge = |(answer, positives): (&Answer, &[usize])| {
             let (index, score) = match stage {
-                Stage::Global => answer.global.first().map(|n| (n.index, -f64::from(n.distance)))?,
-                Stage::Reranked => answer.reranked.first().map(|c| (c.index, f64::from(c.score.spatial_score)))?,
+                Stage::Global => answer
+                    .global
+                    .first()
+                    .map(|n| (n.index, -f64::from(n.distance)))?,
+                Stage::Reranked => answer
+                    .reranked
+                    .first()
+                    .map(|c| (c.index, f64::from(c.score.spatial_score)))?,
             };
-            Some(Judged { score, correct: positives.binary_search(&index).is_ok(), has_match: !positives.is_empty() })
+            Some(Judged {
+                score,
+                correct: positives.binary_search(&index).is_ok(),
+                has_match: !positives.is_empty(),
+            })
         };
-        let as_they_are = answers.iter().map(|&answer| (answer, self.positives(answer)));
+        let as_they_are = answers
+            .iter()
+            .map(|&answer| (answer, self.positives(answer)));
         let without: &[usize] = &[];
-        as_they_are.chain(left_out.iter().map(|answer| (answer, without))).filter_map(judge).collect()
+        as_they_are
+            .chain(left_out.iter().map(|answer| (answer, without)))
+            .filter_map(judge)
+            .collect()
     }
 
     fn poses(&self, answers: &[&Answer]) -> Option<Both<[PoseAccuracy; 3]>> {
-        let known: Vec<&&Answer> =
-            answers.iter().filter(|answer| self.dataset.queries[answer.query].pose.is_some()).collect();
+        let known: Vec<&&Answer> = answers
+            .iter()
+            .filter(|answer| self.dataset.queries[answer.query].pose.is_some())
+            .collect();
         let accuracy = |stage| {
             let pair = |answer: &&&Answer| {
-                let best = ranking(answer, stage).first().and_then(|&index| self.dataset.database[index].pose);
+                let best = ranking(answer, stage)
+                    .first()
+                    .and_then(|&index| self.dataset.database[index].pose);
                 Some((self.dataset.queries[answer.query].pose?, best))
             };
             measure::pose_accuracy(&known.iter().filter_map(pair).collect::<Vec<_>>())
@@ -363,7 +421,14 @@ impl<'a> View<'a> {
             let with_match = self.with_match(&members);
             let recall = Both::of(self.reranked, |stage| self.recall(&with_match, stage));
             let poses = self.poses(&members);
-            (name.to_owned(), GroupSummary { queries_with_match: with_match.len(), recall, poses })
+            (
+                name.to_owned(),
+                GroupSummary {
+                    queries_with_match: with_match.len(),
+                    recall,
+                    poses,
+                },
+            )
         };
         groups.into_iter().map(summary).collect()
     }
@@ -379,21 +444,34 @@ fn fitted_here(best: &BestAnswers, seed: u64) -> Option<CalibrationSummary> {
     let fitted = measure::fit(answers, measure::RIDGE).ok()?;
     let unseen = measure::cross_validate(answers, measure::RIDGE, measure::FOLDS, seed);
     let bins = measure::reliability(&measure::predictions_of(&unseen));
-    Some(CalibrationSummary { fitted, expected_calibration_error: measure::calibration_error(&bins), bins })
+    Some(CalibrationSummary {
+        fitted,
+        expected_calibration_error: measure::calibration_error(&bins),
+        bins,
+    })
 }
 
 /// What the model's own curve comes to on these answers.
 fn shipped_here(best: &BestAnswers, config: &RunConfig) -> Option<Applied> {
     let rerank = config.rerank.as_ref().map(RerankConfig::id);
     // Distances without the head are of another kind.
-    let curve = (config.global == GlobalKind::Head).then(|| shipped_curve(&config.model, rerank.as_ref()))??;
-    let answers = if rerank.is_some() { &best.reranked } else { &best.global };
+    let curve = (config.global == GlobalKind::Head)
+        .then(|| shipped_curve(&config.model, rerank.as_ref()))??;
+    let answers = if rerank.is_some() {
+        &best.reranked
+    } else {
+        &best.global
+    };
     (!answers.is_empty()).then(|| Applied::of(&curve, answers))
 }
 
 /// What a given calibration comes to on these answers.
 fn given_here(best: &BestAnswers, given: &Calibration, reranked: bool) -> Option<Applied> {
-    let answers = if reranked { &best.reranked } else { &best.global };
+    let answers = if reranked {
+        &best.reranked
+    } else {
+        &best.global
+    };
     (!answers.is_empty()).then(|| Applied::of(given.curve(reranked), answers))
 }
 

@@ -1,7 +1,7 @@
 //! GELU with the exact error function, fast enough not to matter.
 //!
-//! The usual scalar `erff` costs a tenth of a whole forward pass. This one is a rational function of x clamped to +-4,
-//! without branches, which the compiler turns into vector code.
+//! The usual scalar `erff` costs a tenth of a whole forward pass. This one is a rational function
+//! of x clamped to +-4, without branches, which the compiler turns into vector code.
 
 /// x / 2 * (1 + erf(x / sqrt 2)), in place.
 pub fn gelu(values: &mut [f32]) {
@@ -16,11 +16,23 @@ fn erf(x: f32) -> f32 {
     let x = x.clamp(-4.0, 4.0);
     let t = x * x;
     let mut p = -2.726_142_4e-10;
-    for c in [2.770_681_3e-8, -2.101_024e-6, -5.692_506_4e-5, -7.349_906e-4, -2.954_6e-3, -1.609_603_3e-2] {
+    for c in [
+        2.770_681_3e-8,
+        -2.101_024e-6,
+        -5.692_506_4e-5,
+        -7.349_906e-4,
+        -2.954_6e-3,
+        -1.609_603_3e-2,
+    ] {
         p = p * t + c;
     }
     let mut q = -1.456_607_2e-5;
-    for c in [-2.133_740_6e-4, -1.682_827e-3, -7.373_329_2e-3, -1.426_473_9e-2] {
+    for c in [
+        -2.133_740_6e-4,
+        -1.682_827e-3,
+        -7.373_329_2e-3,
+        -1.426_473_9e-2,
+    ] {
         q = q * t + c;
     }
     x * p / q
@@ -47,7 +59,10 @@ mod tests {
             .map(|x| (erf(x as f32) as f64 - reference(x)).abs())
             .fold(0.0, f64::max);
         assert!(worst < 5e-7, "{worst:e}");
-        assert_eq!((erf(0.0), erf(f32::INFINITY).round(), erf(-100.0).round()), (0.0, 1.0, -1.0));
+        assert_eq!(
+            (erf(0.0), erf(f32::INFINITY).round(), erf(-100.0).round()),
+            (0.0, 1.0, -1.0)
+        );
     }
 
     #[test]

@@ -1,10 +1,11 @@
 //! How the patch tokens of an image become the one vector that the head projects.
 //!
-//! The paper takes their mean (III-A). Two alternatives from the field can be carried by a head file in its place:
-//! the generalised mean (GeM, Radenovic et al. 2018), which lets strong activations weigh more, and VLAD (Jegou et al.
-//! 2010; on such tokens: AnyLoc, 2023), which keeps one sum of residuals per visual word. The result is what a store
-//! keeps beside the key patches so that a map can be given another head, and only a head with the very same aggregate
-//! can take it: the mean cannot be turned into a VLAD without the image.
+//! The paper takes their mean (III-A). Two alternatives from the field can be carried by a head
+//! file in its place: the generalised mean (GeM, Radenovic et al. 2018), which lets strong
+//! activations weigh more, and VLAD (Jegou et al. 2010; on such tokens: AnyLoc, 2023), which keeps
+//! one sum of residuals per visual word. The result is what a store keeps beside the key patches so
+//! that a map can be given another head, and only a head with the very same aggregate can take it:
+//! the mean cannot be turned into a VLAD without the image.
 
 use super::error::ExtractError;
 use super::global::{l2_normalise, mean_token, squared_distance};
@@ -28,9 +29,10 @@ pub enum Aggregate {
         /// The power, from 1 to 64.
         p: f32,
     },
-    /// Sums of residuals to visual words; `words * d` values. For the 16 words of 384 values that `head fit` makes
-    /// unless told otherwise that is 12 kB of half floats in every stored reference, against 0.8 kB of a mean and some
-    /// 117 kB of key patches; what is searched stays 256 values.
+    /// Sums of residuals to visual words; `words * d` values. For the 16 words of 384 values that
+    /// `head fit` makes unless told otherwise that is 12 kB of half floats in every stored
+    /// reference, against 0.8 kB of a mean and some 117 kB of key patches; what is searched stays
+    /// 256 values.
     Vlad(VladWords),
 }
 
@@ -48,7 +50,9 @@ impl Aggregate {
         if (1.0..=64.0).contains(&p) {
             Ok(Self::Gem { p })
         } else {
-            Err(format!("the power of a generalised mean must lie from 1 to 64, not {p}"))
+            Err(format!(
+                "the power of a generalised mean must lie from 1 to 64, not {p}"
+            ))
         }
     }
 
@@ -80,8 +84,8 @@ impl Aggregate {
         pooled
     }
 
-    /// What it adds to the hash of a head; nothing for the mean, so that heads made before there was a choice keep
-    /// their hash.
+    /// What it adds to the hash of a head; nothing for the mean, so that heads made before there
+    /// was a choice keep their hash.
     pub(super) fn hash_into(&self, hasher: &mut Sha256) {
         match self {
             Self::Mean => {}
@@ -97,7 +101,8 @@ impl Aggregate {
     }
 }
 
-/// Equal text means equal pooled vectors: `mean`, `gem3`, `vlad16-0f1e2d3c` (words, and the start of their hash).
+/// Equal text means equal pooled vectors: `mean`, `gem3`, `vlad16-0f1e2d3c` (words, and the start
+/// of their hash).
 impl fmt::Display for Aggregate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -116,10 +121,14 @@ fn generalised_mean(tokens: &[f32], dim: usize, p: f64) -> Vec<f32> {
     let power = |value: f64, p: f64| value.abs().powf(p).copysign(value);
     let mut sums = vec![0f64; dim];
     for token in tokens.chunks_exact(dim) {
-        sums.iter_mut().zip(token).for_each(|(sum, &value)| *sum += power(f64::from(value), p));
+        sums.iter_mut()
+            .zip(token)
+            .for_each(|(sum, &value)| *sum += power(f64::from(value), p));
     }
     let count = (tokens.len() / dim).max(1) as f64;
-    sums.iter().map(|sum| power(sum / count, 1.0 / p) as f32).collect()
+    sums.iter()
+        .map(|sum| power(sum / count, 1.0 / p) as f32)
+        .collect()
 }
 
 impl VladWords {
@@ -130,21 +139,31 @@ impl VladWords {
             || !words.len().is_multiple_of(dim)
             || words.iter().any(|value| !value.is_finite())
         {
-            return Err(format!("visual words must be finite rows of one length; {} values do not fit", words.len()));
+            return Err(format!(
+                "visual words must be finite rows of one length; {} values do not fit",
+                words.len()
+            ));
         }
         Ok(Self { words, dim })
     }
 
-    /// Learns `count` words from tokens `[n, dim]` by k-means with k-means++ seeding; `seed` decides every draw.
+    /// Learns `count` words from tokens `[n, dim]` by k-means with k-means++ seeding; `seed`
+    /// decides every draw.
     ///
     /// # Errors
     /// There are fewer tokens than words.
     pub fn fit(tokens: &[f32], dim: usize, count: usize, seed: u64) -> Result<Self, ExtractError> {
         let rows: Vec<Vec<f32>> = tokens.par_chunks_exact(dim).map(unit).collect();
         if count == 0 || rows.len() < count {
-            return Err(ExtractError::TooFewTokens { words: count, tokens: rows.len() });
+            return Err(ExtractError::TooFewTokens {
+                words: count,
+                tokens: rows.len(),
+            });
         }
-        let mut fitted = Self { words: first_words(&rows, count, seed), dim };
+        let mut fitted = Self {
+            words: first_words(&rows, count, seed),
+            dim,
+        };
         let mut assigned = vec![usize::MAX; rows.len()];
         // It settles within some twenty rounds; the bound is for ties that never do.
         for _ in 0..100 {
@@ -175,19 +194,27 @@ impl VladWords {
 
     /// Index of the nearest word; of equally near ones the first.
     fn nearest(&self, token: &[f32]) -> usize {
-        let distances = self.words.chunks_exact(self.dim).map(|word| squared_distance(word, token));
-        distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(index, _)| index)
+        let distances = self
+            .words
+            .chunks_exact(self.dim)
+            .map(|word| squared_distance(word, token));
+        distances
+            .enumerate()
+            .min_by(|a, b| a.1.total_cmp(&b.1))
+            .map_or(0, |(index, _)| index)
     }
 
-    /// Sums of the residuals of unit-length tokens to their nearest words, each word's sum scaled to unit length so
-    /// that a repeated texture does not drown the rest.
+    /// Sums of the residuals of unit-length tokens to their nearest words, each word's sum scaled
+    /// to unit length so that a repeated texture does not drown the rest.
     fn residuals(&self, tokens: &[f32]) -> Vec<f32> {
         let mut sums = vec![0f64; self.words.len()];
         for token in tokens.chunks_exact(self.dim).map(unit) {
             let start = self.nearest(&token) * self.dim;
             let word = &self.words[start..start + self.dim];
             let sum = &mut sums[start..start + self.dim];
-            sum.iter_mut().zip(token.iter().zip(word)).for_each(|(sum, (t, w))| *sum += f64::from(t - w));
+            sum.iter_mut()
+                .zip(token.iter().zip(word))
+                .for_each(|(sum, (t, w))| *sum += f64::from(t - w));
         }
         let mut residuals: Vec<f32> = sums.iter().map(|&sum| sum as f32).collect();
         residuals.chunks_exact_mut(self.dim).for_each(l2_normalise);
@@ -201,17 +228,25 @@ impl VladWords {
         for (row, &word) in rows.iter().zip(assigned) {
             counts[word] += 1;
             let sum = &mut sums[word * self.dim..(word + 1) * self.dim];
-            sum.iter_mut().zip(row).for_each(|(sum, &value)| *sum += f64::from(value));
+            sum.iter_mut()
+                .zip(row)
+                .for_each(|(sum, &value)| *sum += f64::from(value));
         }
         for (word, &count) in counts.iter().enumerate().filter(|&(_, &count)| count > 0) {
             let place = word * self.dim..(word + 1) * self.dim;
-            let means = sums[place.clone()].iter().map(|sum| (sum / count as f64) as f32);
-            self.words[place].iter_mut().zip(means).for_each(|(value, mean)| *value = mean);
+            let means = sums[place.clone()]
+                .iter()
+                .map(|sum| (sum / count as f64) as f32);
+            self.words[place]
+                .iter_mut()
+                .zip(means)
+                .for_each(|(value, mean)| *value = mean);
         }
     }
 }
 
-/// k-means++: each further word is a row drawn in proportion to its squared distance from the words so far.
+/// k-means++: each further word is a row drawn in proportion to its squared distance from the words
+/// so far.
 fn first_words(rows: &[Vec<f32>], count: usize, seed: u64) -> Vec<f32> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut words = rows[rng.random_range(0..rows.len())].clone();
@@ -219,7 +254,10 @@ fn first_words(rows: &[Vec<f32>], count: usize, seed: u64) -> Vec<f32> {
     let dim = words.len();
     for _ in 1..count {
         let last = &words[words.len() - dim..];
-        distances.par_iter_mut().zip(rows).for_each(|(near, row)| *near = near.min(squared_distance(last, row)));
+        distances
+            .par_iter_mut()
+            .zip(rows)
+            .for_each(|(near, row)| *near = near.min(squared_distance(last, row)));
         let total: f64 = distances.iter().map(|&distance| f64::from(distance)).sum();
         let mut left = rng.random::<f64>() * total;
         let drawn = distances.iter().position(|&distance| {
@@ -233,13 +271,18 @@ fn first_words(rows: &[Vec<f32>], count: usize, seed: u64) -> Vec<f32> {
     words
 }
 
-/// `count` rows of tokens `[n, dim]` drawn without repetition, or all if there are fewer; for [`VladWords::fit`].
+/// `count` rows of tokens `[n, dim]` drawn without repetition, or all if there are fewer; for
+/// [`VladWords::fit`].
 pub fn sample_tokens(tokens: &[f32], dim: usize, count: usize, seed: u64) -> Vec<f32> {
     let n = tokens.len() / dim;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut drawn = index::sample(&mut rng, n, count.min(n)).into_vec();
     drawn.sort_unstable();
-    drawn.iter().flat_map(|&row| &tokens[row * dim..(row + 1) * dim]).copied().collect()
+    drawn
+        .iter()
+        .flat_map(|&row| &tokens[row * dim..(row + 1) * dim])
+        .copied()
+        .collect()
 }
 
 fn unit(token: &[f32]) -> Vec<f32> {
@@ -263,7 +306,11 @@ mod tests {
 
     fn kinds() -> [Aggregate; 3] {
         let words = (0..8).map(|i| ((i * 5) % 7) as f32 / 7.0 - 0.4).collect();
-        [Aggregate::Mean, Aggregate::gem(3.0).unwrap(), Aggregate::Vlad(VladWords::new(words, 4).unwrap())]
+        [
+            Aggregate::Mean,
+            Aggregate::gem(3.0).unwrap(),
+            Aggregate::Vlad(VladWords::new(words, 4).unwrap()),
+        ]
     }
 
     proptest! {
@@ -301,7 +348,10 @@ mod tests {
     #[test]
     fn a_high_power_approaches_the_largest_magnitude() {
         let pooled = generalised_mean(&[0.1, -3.0, 2.0, -0.5, 1.0, 0.2], 2, 60.0);
-        assert!((pooled[0] - 2.0).abs() < 0.05 && (pooled[1] + 3.0).abs() < 0.1, "{pooled:?}");
+        assert!(
+            (pooled[0] - 2.0).abs() < 0.05 && (pooled[1] + 3.0).abs() < 0.1,
+            "{pooled:?}"
+        );
         assert!(Aggregate::gem(0.5).is_err() && Aggregate::gem(f32::NAN).is_err());
     }
 
@@ -309,12 +359,20 @@ mod tests {
     fn words_settle_on_the_clusters_of_the_tokens() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let centres = [[1.0f32, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]];
-        let tokens: Vec<f32> =
-            (0..300).flat_map(|i| centres[i % 3].map(|value| 5.0 * (value + rng.random_range(-0.05..0.05)))).collect();
+        let tokens: Vec<f32> = (0..300)
+            .flat_map(|i| centres[i % 3].map(|value| 5.0 * (value + rng.random_range(-0.05..0.05))))
+            .collect();
         let words = VladWords::fit(&tokens, 3, 3, 9).unwrap();
         for centre in centres {
-            let nearest = words.values().chunks(3).map(|word| squared_distance(word, &centre)).fold(f32::MAX, f32::min);
-            assert!(nearest < 0.01, "{centre:?} is {nearest} from the nearest word");
+            let nearest = words
+                .values()
+                .chunks(3)
+                .map(|word| squared_distance(word, &centre))
+                .fold(f32::MAX, f32::min);
+            assert!(
+                nearest < 0.01,
+                "{centre:?} is {nearest} from the nearest word"
+            );
         }
         assert_eq!(words, VladWords::fit(&tokens, 3, 3, 9).unwrap());
         assert!(VladWords::fit(&tokens[..6], 3, 3, 9).is_err());
@@ -325,7 +383,10 @@ mod tests {
     fn a_residual_goes_to_the_nearest_word_alone() {
         let vlad = VladWords::new(vec![1.0, 0.0, 0.0, 1.0], 2).unwrap();
         let residuals = vlad.residuals(&[10.0, 1.0]);
-        assert!(residuals[1] > 0.9 && residuals[2..] == [0.0, 0.0], "{residuals:?}");
+        assert!(
+            residuals[1] > 0.9 && residuals[2..] == [0.0, 0.0],
+            "{residuals:?}"
+        );
     }
 
     #[test]

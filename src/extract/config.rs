@@ -15,7 +15,8 @@ use std::str::FromStr;
 pub struct ExtractConfig {
     /// The backbone.
     pub preset: Preset,
-    /// Weights file of one's own for the preset's geometry; the preset's published ones, pulled on first use, unless set.
+    /// Weights file of one's own for the preset's geometry; the preset's published ones, pulled on
+    /// first use, unless set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub weights: Option<PathBuf>,
     /// Size images are squashed to, each side a multiple of the patch size.
@@ -30,10 +31,12 @@ pub struct ExtractConfig {
     /// 0-based block whose CLS attention ranks patches; the exit block unless set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub attention_block: Option<usize>,
-    /// Attention heads, for weights trained with another count than the preset's (no tensor's shape reveals it).
+    /// Attention heads, for weights trained with another count than the preset's (no tensor's shape
+    /// reveals it).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub heads: Option<usize>,
-    /// Key patches must exceed this multiple of the uniform attention heads/n; 1 is the paper's 0.01.
+    /// Key patches must exceed this multiple of the uniform attention heads/n; 1 is the paper's
+    /// 0.01.
     pub tau: f32,
     /// Most key patches at scales 1, 2 and 3.
     pub caps: [usize; SCALES],
@@ -71,7 +74,8 @@ pub enum HeadChoice {
     /// The one built in for this backbone; an error where there is none.
     #[default]
     Default,
-    /// None: the pooled token itself, of the backbone's width. For evaluation and for fitting heads; not searchable.
+    /// None: the pooled token itself, of the backbone's width. For evaluation and for fitting
+    /// heads; not searchable.
     None,
     /// A file.
     File(PathBuf),
@@ -148,30 +152,59 @@ impl ExtractConfig {
         let geometry = self.preset.geometry();
         let (size, patch) = (spec.input_size, geometry.patch as u32);
         let refuse = |field, reason: String| Err(InvalidValue::new(field, reason));
-        if size.width == 0 || size.height == 0 || size.width % patch != 0 || size.height % patch != 0 {
+        if size.width == 0
+            || size.height == 0
+            || size.width % patch != 0
+            || size.height % patch != 0
+        {
             let nearest = |side: u32| ((side + patch / 2) / patch).max(1) * patch;
-            let suggestion = ImageSize { width: nearest(size.width), height: nearest(size.height) };
-            return refuse("input_size", format!("{size} is not whole patches of {patch} pixels; try {suggestion}"));
+            let suggestion = ImageSize {
+                width: nearest(size.width),
+                height: nearest(size.height),
+            };
+            return refuse(
+                "input_size",
+                format!("{size} is not whole patches of {patch} pixels; try {suggestion}"),
+            );
         }
         let (columns, rows) = geometry.grid(size);
         if columns.saturating_mul(rows) > LARGEST_GRID {
-            return refuse("input_size", format!("{size} makes more than {LARGEST_GRID} patches"));
+            return refuse(
+                "input_size",
+                format!("{size} makes more than {LARGEST_GRID} patches"),
+            );
         }
-        for (field, block) in [("exit_block", spec.exit_block), ("attention_block", spec.attention_block)] {
+        for (field, block) in [
+            ("exit_block", spec.exit_block),
+            ("attention_block", spec.attention_block),
+        ] {
             if block >= geometry.depth {
-                return refuse(field, format!("{block} is beyond the last block, {}", geometry.depth - 1));
+                return refuse(
+                    field,
+                    format!("{block} is beyond the last block, {}", geometry.depth - 1),
+                );
             }
         }
-        if let Some(heads) = self.heads.filter(|&heads| heads == 0 || !geometry.dim.is_multiple_of(heads)) {
-            return refuse("heads", format!("{heads} does not divide the token width {}", geometry.dim));
+        if let Some(heads) = self
+            .heads
+            .filter(|&heads| heads == 0 || !geometry.dim.is_multiple_of(heads))
+        {
+            return refuse(
+                "heads",
+                format!("{heads} does not divide the token width {}", geometry.dim),
+            );
         }
         if !self.tau.is_finite() || self.tau < 0.0 {
             return refuse("tau", format!("{} is not a non-negative number", self.tau));
         }
-        if self.caps.iter().any(|&cap| cap > LARGEST_GRID) || self.caps.iter().all(|&cap| cap == 0) {
+        if self.caps.iter().any(|&cap| cap > LARGEST_GRID) || self.caps.iter().all(|&cap| cap == 0)
+        {
             return refuse(
                 "caps",
-                format!("{:?} must hold a positive number and none above {LARGEST_GRID}", self.caps),
+                format!(
+                    "{:?} must hold a positive number and none above {LARGEST_GRID}",
+                    self.caps
+                ),
             );
         }
         Ok(())
@@ -185,18 +218,48 @@ mod tests {
     #[test]
     fn what_is_unset_is_the_presets() {
         let spec = ExtractConfig::default().encoder_spec().unwrap();
-        assert_eq!((spec.exit_block, spec.attention_block, spec.token_norm, spec.blocks()), (8, 8, false, 9));
-        let paper = ExtractConfig { preset: Preset::PlaceformerVits16, ..Default::default() }.encoder_spec().unwrap();
+        assert_eq!(
+            (
+                spec.exit_block,
+                spec.attention_block,
+                spec.token_norm,
+                spec.blocks()
+            ),
+            (8, 8, false, 9)
+        );
+        let paper = ExtractConfig {
+            preset: Preset::PlaceformerVits16,
+            ..Default::default()
+        }
+        .encoder_spec()
+        .unwrap();
         assert_eq!((paper.exit_block, paper.token_norm), (11, true));
-        assert_eq!(paper.input_size, ImageSize { width: 640, height: 480 });
+        assert_eq!(
+            paper.input_size,
+            ImageSize {
+                width: 640,
+                height: 480
+            }
+        );
     }
 
     #[test]
     fn settings_survive_toml() {
-        let config = ExtractConfig { head: HeadChoice::File("h.safetensors".into()), ..Default::default() };
+        let config = ExtractConfig {
+            head: HeadChoice::File("h.safetensors".into()),
+            ..Default::default()
+        };
         let config = config.effective().unwrap();
-        assert_eq!(toml::from_str::<ExtractConfig>(&toml::to_string(&config).unwrap()).unwrap(), config);
-        assert!(toml::from_str::<ExtractConfig>("tua = 1.0").unwrap_err().to_string().contains("tua"));
+        assert_eq!(
+            toml::from_str::<ExtractConfig>(&toml::to_string(&config).unwrap()).unwrap(),
+            config
+        );
+        assert!(
+            toml::from_str::<ExtractConfig>("tua = 1.0")
+                .unwrap_err()
+                .to_string()
+                .contains("tua")
+        );
     }
 
     #[test]
@@ -206,10 +269,21 @@ mod tests {
             change(&mut config);
             config.encoder_spec().unwrap_err()
         };
-        let wrong_size = broken(|c| c.input_size = Some(ImageSize { width: 640, height: 480 }));
-        assert!(wrong_size.field == "input_size" && wrong_size.reason.contains("644x476"), "{wrong_size}");
+        let wrong_size = broken(|c| {
+            c.input_size = Some(ImageSize {
+                width: 640,
+                height: 480,
+            })
+        });
+        assert!(
+            wrong_size.field == "input_size" && wrong_size.reason.contains("644x476"),
+            "{wrong_size}"
+        );
         assert_eq!(broken(|c| c.exit_block = Some(12)).field, "exit_block");
-        assert_eq!(broken(|c| c.attention_block = Some(12)).field, "attention_block");
+        assert_eq!(
+            broken(|c| c.attention_block = Some(12)).field,
+            "attention_block"
+        );
         assert_eq!(broken(|c| c.heads = Some(7)).field, "heads");
         assert_eq!(broken(|c| c.tau = f32::NAN).field, "tau");
         assert_eq!(broken(|c| c.caps = [0, 0, 0]).field, "caps");

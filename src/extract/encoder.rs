@@ -1,4 +1,5 @@
-//! The door between the transformer and everything after it, so that how it is computed can be chosen at start.
+//! The door between the transformer and everything after it, so that how it is computed can be
+//! chosen at start.
 
 use super::error::ExtractError;
 use super::preset::Geometry;
@@ -7,7 +8,8 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// Which part of the transformer an encoder computes. Blocks beyond the last one named here are never run.
+/// Which part of the transformer an encoder computes. Blocks beyond the last one named here are
+/// never run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct EncoderSpec {
     /// Size of every image.
@@ -61,8 +63,8 @@ pub struct EncodedImage {
     pub tokens: Vec<f32>,
     /// The CLS token at the same point, `[dim]`.
     pub cls_token: Vec<f32>,
-    /// Softmax attention of the CLS query over the patch keys of the attention block, the CLS key dropped and the rest
-    /// not renormalised, `[heads, n]`.
+    /// Softmax attention of the CLS query over the patch keys of the attention block, the CLS key
+    /// dropped and the rest not renormalised, `[heads, n]`.
     pub cls_attention: Vec<f32>,
 }
 
@@ -85,7 +87,8 @@ pub trait Encoder: Send + Sync {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// The fastest whose answers, re-ranked, are as good as those of f32: mixed where the CPU multiplies int8 vectors, else f32.
+    /// The fastest whose answers, re-ranked, are as good as those of f32: mixed where the CPU
+    /// multiplies int8 vectors, else f32.
     #[default]
     Auto,
     /// 32-bit floats.
@@ -124,20 +127,36 @@ impl FromStr for Precision {
     type Err = InvalidValue;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        Self::ALL.into_iter().find(|precision| precision.name().eq_ignore_ascii_case(text)).ok_or_else(|| {
-            InvalidValue::new("precision", format!("{text:?} is not one of {}", Self::ALL.map(Self::name).join(", ")))
-        })
+        Self::ALL
+            .into_iter()
+            .find(|precision| precision.name().eq_ignore_ascii_case(text))
+            .ok_or_else(|| {
+                InvalidValue::new(
+                    "precision",
+                    format!(
+                        "{text:?} is not one of {}",
+                        Self::ALL.map(Self::name).join(", ")
+                    ),
+                )
+            })
     }
 }
 
 /// Refuses an image whose size or length is not what the spec and `geometry` need.
 pub fn check_image(image: &ImageTensor, spec: &EncoderSpec) -> Result<(), ExtractError> {
     if image.size != spec.input_size {
-        return Err(ExtractError::WrongSize { expected: spec.input_size, actual: image.size });
+        return Err(ExtractError::WrongSize {
+            expected: spec.input_size,
+            actual: image.size,
+        });
     }
     let expected = 3 * image.size.width as usize * image.size.height as usize;
     if image.data.len() != expected {
-        return Err(ExtractError::WrongLength { size: image.size, expected, actual: image.data.len() });
+        return Err(ExtractError::WrongLength {
+            size: image.size,
+            expected,
+            actual: image.data.len(),
+        });
     }
     Ok(())
 }

@@ -52,7 +52,10 @@ pub enum ExtractError {
     #[error("cannot obtain the weights")]
     Pull(#[source] Box<PullError>),
     /// The head was made for other tokens.
-    #[error("the head{} was fitted for {head_backbone}, the model is {backbone}", at(path))]
+    #[error(
+        "the head{} was fitted for {head_backbone}, the model is {backbone}",
+        at(path)
+    )]
     HeadMismatch {
         /// The head's file, unless it is the one built in.
         path: Option<PathBuf>,
@@ -89,7 +92,9 @@ pub enum ExtractError {
         actual: usize,
     },
     /// NaN or infinity came out: the input or the weights are broken.
-    #[error("the transformer produced values that are not finite; the input image or the weights are broken")]
+    #[error(
+        "the transformer produced values that are not finite; the input image or the weights are broken"
+    )]
     NotFinite,
     /// The machine cannot compute at the precision asked for.
     #[error("precision {precision} is not available: {reason}")]
@@ -135,7 +140,9 @@ pub enum ExtractError {
 }
 
 fn at(path: &Option<PathBuf>) -> String {
-    path.as_ref().map(|path| format!(" {}", path.display())).unwrap_or_default()
+    path.as_ref()
+        .map(|path| format!(" {}", path.display()))
+        .unwrap_or_default()
 }
 
 impl ExtractError {

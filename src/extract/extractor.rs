@@ -11,7 +11,9 @@ use super::trace::ExtractionTrace;
 use super::weights::VitWeights;
 use super::{fusion, model_id, positions, pull, record, selection};
 use crate::kernels;
-use crate::types::{Descriptor, ImageSize, ImageTensor, InvalidValue, KeyPatches, ModelId, PackedPatches, PatchGrid};
+use crate::types::{
+    Descriptor, ImageSize, ImageTensor, InvalidValue, KeyPatches, ModelId, PackedPatches, PatchGrid,
+};
 use std::path::Path;
 
 /// A loaded model with its head.
@@ -29,7 +31,8 @@ pub struct Extractor {
 }
 
 impl Extractor {
-    /// Opens the model that the settings name: the weights file they give, else the preset's own, fetched on first use.
+    /// Opens the model that the settings name: the weights file they give, else the preset's own,
+    /// fetched on first use.
     ///
     /// May fetch, and reads and hashes some hundred megabytes: call it off the async threads.
     pub fn open(config: &ExtractConfig) -> Result<Self, ExtractError> {
@@ -47,7 +50,11 @@ impl Extractor {
     }
 
     /// As [`Extractor::load`], from weights in memory.
-    pub fn from_weights(config: &ExtractConfig, weights: &VitWeights, head: &HeadChoice) -> Result<Self, ExtractError> {
+    pub fn from_weights(
+        config: &ExtractConfig,
+        weights: &VitWeights,
+        head: &HeadChoice,
+    ) -> Result<Self, ExtractError> {
         let spec = config.encoder_spec()?;
         let geometry = weights.geometry;
         let grid = token_grid(&geometry, &spec);
@@ -67,13 +74,16 @@ impl Extractor {
         })
     }
 
-    /// The same model computed by another encoder, such as the plain one that the fused one is tested against.
+    /// The same model computed by another encoder, such as the plain one that the fused one is
+    /// tested against.
     ///
     /// # Errors
     /// One that computes something else than the settings say.
     pub fn with_encoder(self, encoder: Box<dyn Encoder>) -> Result<Self, ExtractError> {
         if encoder.spec() != self.encoder.spec() {
-            return Err(InvalidValue::new("encoder", format!("it computes {:?}", encoder.spec())).into());
+            return Err(
+                InvalidValue::new("encoder", format!("it computes {:?}", encoder.spec())).into(),
+            );
         }
         Ok(Self { encoder, ..self })
     }
@@ -133,29 +143,52 @@ impl Extractor {
         let describe = |encoded: &EncodedImage| {
             let pooled = pool(encoded, self.aggregate())?;
             let global = self.global(&pooled);
-            Ok(Descriptor { global, pooled, patches: PackedPatches::quantise(&self.key_patches(encoded)) })
+            Ok(Descriptor {
+                global,
+                pooled,
+                patches: PackedPatches::quantise(&self.key_patches(encoded)),
+            })
         };
         self.encoder.encode(images)?.iter().map(describe).collect()
     }
 
     /// Key patches in full precision beside the descriptor, for measuring what quantisation costs.
-    pub fn extract_full(&self, images: &[ImageTensor]) -> Result<Vec<(Descriptor, KeyPatches)>, ExtractError> {
+    pub fn extract_full(
+        &self,
+        images: &[ImageTensor],
+    ) -> Result<Vec<(Descriptor, KeyPatches)>, ExtractError> {
         let describe = |encoded: &EncodedImage| {
             let pooled = pool(encoded, self.aggregate())?;
             let (global, keys) = (self.global(&pooled), self.key_patches(encoded));
-            Ok((Descriptor { global, pooled, patches: PackedPatches::quantise(&keys) }, keys))
+            Ok((
+                Descriptor {
+                    global,
+                    pooled,
+                    patches: PackedPatches::quantise(&keys),
+                },
+                keys,
+            ))
         };
         self.encoder.encode(images)?.iter().map(describe).collect()
     }
 
-    /// The pooled tokens of each image, by the head's own aggregate: all that training a head needs.
+    /// The pooled tokens of each image, by the head's own aggregate: all that training a head
+    /// needs.
     pub fn pooled(&self, images: &[ImageTensor]) -> Result<Vec<Vec<f32>>, ExtractError> {
         self.pooled_by(images, self.aggregate())
     }
 
     /// The tokens of each image pooled by `aggregate`, of unit length, for fitting a head of it.
-    pub fn pooled_by(&self, images: &[ImageTensor], aggregate: &Aggregate) -> Result<Vec<Vec<f32>>, ExtractError> {
-        self.encoder.encode(images)?.iter().map(|encoded| pool(encoded, aggregate)).collect()
+    pub fn pooled_by(
+        &self,
+        images: &[ImageTensor],
+        aggregate: &Aggregate,
+    ) -> Result<Vec<Vec<f32>>, ExtractError> {
+        self.encoder
+            .encode(images)?
+            .iter()
+            .map(|encoded| pool(encoded, aggregate))
+            .collect()
     }
 
     /// How tokens become the vector that the head takes; the mean where there is no head.
@@ -187,16 +220,21 @@ impl Extractor {
         })
     }
 
-    /// Runs one image through, so that the first request pays for no page fault and no thread start.
+    /// Runs one image through, so that the first request pays for no page fault and no thread
+    /// start.
     pub fn warm_up(&self) -> Result<(), ExtractError> {
         let size = self.input_size();
         let wave = |i: usize| ((i % 251) as f32 / 125.0 - 1.0) * ((i / 251 % 13) as f32 / 6.0);
-        let data = (0..3 * size.width as usize * size.height as usize).map(wave).collect();
+        let data = (0..3 * size.width as usize * size.height as usize)
+            .map(wave)
+            .collect();
         self.extract(&[ImageTensor { size, data }]).map(drop)
     }
 
     fn global(&self, pooled: &[f32]) -> Vec<f32> {
-        self.head.as_ref().map_or_else(|| pooled.to_vec(), |head| head.project(pooled))
+        self.head
+            .as_ref()
+            .map_or_else(|| pooled.to_vec(), |head| head.project(pooled))
     }
 
     fn key_patches(&self, encoded: &EncodedImage) -> KeyPatches {
@@ -207,40 +245,66 @@ impl Extractor {
             stride: self.config.stride,
         };
         let (caps, tau) = (self.config.caps, self.config.tau);
-        selection::key_patches(&encoded.tokens, &encoded.cls_attention, encoded.heads, grid, caps, tau)
+        selection::key_patches(
+            &encoded.tokens,
+            &encoded.cls_attention,
+            encoded.heads,
+            grid,
+            caps,
+            tau,
+        )
     }
 }
 
 fn pool(encoded: &EncodedImage, aggregate: &Aggregate) -> Result<Vec<f32>, ExtractError> {
     let pooled = aggregate.pool(&encoded.tokens, encoded.dim);
-    if pooled.iter().chain(&encoded.cls_attention).any(|value| !value.is_finite()) {
+    if pooled
+        .iter()
+        .chain(&encoded.cls_attention)
+        .any(|value| !value.is_finite())
+    {
         return Err(ExtractError::NotFinite);
     }
     Ok(pooled)
 }
 
-/// The encoder for `precision`, after every kernel it may use has agreed with its scalar twin on this machine.
+/// The encoder for `precision`, after every kernel it may use has agreed with its scalar twin on
+/// this machine.
 pub fn build_encoder(
     weights: &VitWeights,
     spec: &EncoderSpec,
     precision: Precision,
 ) -> Result<Box<dyn Encoder>, ExtractError> {
     let simd = kernels::self_check()?;
-    Ok(Box::new(FusedEncoder::new(weights, *spec, simd, precision)?))
+    Ok(Box::new(FusedEncoder::new(
+        weights, *spec, simd, precision,
+    )?))
 }
 
-fn choose_head(choice: &HeadChoice, backbone: &str, dim: usize) -> Result<Option<Head>, ExtractError> {
+fn choose_head(
+    choice: &HeadChoice,
+    backbone: &str,
+    dim: usize,
+) -> Result<Option<Head>, ExtractError> {
     let (head, path) = match choice {
         HeadChoice::None => return Ok(None),
         HeadChoice::Default => match Head::built_in(backbone)? {
             Some(head) => (head, None),
-            None => return Err(ExtractError::NoHead { backbone: backbone.to_owned() }),
+            None => {
+                return Err(ExtractError::NoHead {
+                    backbone: backbone.to_owned(),
+                });
+            }
         },
         HeadChoice::File(path) => (Head::load(path)?, Some(path.clone())),
     };
     if head.backbone() != backbone || head.token_dim() != dim {
         let head_backbone = format!("{} ({}-d)", head.backbone(), head.token_dim());
-        return Err(ExtractError::HeadMismatch { path, head_backbone, backbone: format!("{backbone} ({dim}-d)") });
+        return Err(ExtractError::HeadMismatch {
+            path,
+            head_backbone,
+            backbone: format!("{backbone} ({dim}-d)"),
+        });
     }
     Ok(Some(head))
 }

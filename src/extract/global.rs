@@ -1,10 +1,14 @@
-//! The mean over patch tokens, L2-normalised (paper III-A); the head then projects it to the global descriptor.
+//! The mean over patch tokens, L2-normalised (paper III-A); the head then projects it to the global
+//! descriptor.
 
-/// Mean of the tokens `[n, dim]`, summed in f64 so that the order of n hundred values does not matter.
+/// Mean of the tokens `[n, dim]`, summed in f64 so that the order of n hundred values does not
+/// matter.
 pub fn mean_token(tokens: &[f32], dim: usize) -> Vec<f32> {
     let mut sums = vec![0f64; dim];
     for token in tokens.chunks_exact(dim) {
-        sums.iter_mut().zip(token).for_each(|(sum, &value)| *sum += value as f64);
+        sums.iter_mut()
+            .zip(token)
+            .for_each(|(sum, &value)| *sum += value as f64);
     }
     let count = (tokens.len() / dim).max(1) as f64;
     sums.iter().map(|sum| (sum / count) as f32).collect()
@@ -17,9 +21,15 @@ pub fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
 
 /// Scales to unit length; a zero vector stays zero.
 pub fn l2_normalise(vector: &mut [f32]) {
-    let norm = vector.iter().map(|&v| v as f64 * v as f64).sum::<f64>().sqrt();
+    let norm = vector
+        .iter()
+        .map(|&v| v as f64 * v as f64)
+        .sum::<f64>()
+        .sqrt();
     if norm > 0.0 {
-        vector.iter_mut().for_each(|v| *v = (*v as f64 / norm) as f32);
+        vector
+            .iter_mut()
+            .for_each(|v| *v = (*v as f64 / norm) as f32);
     }
 }
 

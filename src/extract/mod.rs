@@ -1,4 +1,5 @@
-//! A normalised image to its descriptor: transformer, global descriptor, fusion, selection (paper III-A to III-C).
+//! A normalised image to its descriptor: transformer, global descriptor, fusion, selection (paper
+//! III-A to III-C).
 //!
 //! ```text
 //! ImageTensor --encoder--> tokens [n, d], CLS attention [heads, n]
@@ -6,9 +7,9 @@
 //!     attention --fusion--> per scale --selection--> key patches, fused from tokens
 //! ```
 //!
-//! [`Extractor`] puts it together from [`ExtractConfig`], a weights file and a [`Head`]; [`pull`] obtains the weights.
-//! [`Encoder`] is the seam between them and the transformer: [`FusedEncoder`] computes it for the service,
-//! [`CandleEncoder`] is the plain implementation it is tested against.
+//! [`Extractor`] puts it together from [`ExtractConfig`], a weights file and a [`Head`]; [`pull`]
+//! obtains the weights. [`Encoder`] is the seam between them and the transformer: [`FusedEncoder`]
+//! computes it for the service, [`CandleEncoder`] is the plain implementation it is tested against.
 
 mod activation;
 mod aggregate;
@@ -33,7 +34,9 @@ mod weights;
 
 pub use aggregate::{Aggregate, VladWords, sample_tokens};
 pub use config::{ExtractConfig, HeadChoice};
-pub use encoder::{EncodedImage, Encoder, EncoderSpec, Precision, TokenGrid, check_image, token_grid};
+pub use encoder::{
+    EncodedImage, Encoder, EncoderSpec, Precision, TokenGrid, check_image, token_grid,
+};
 pub use error::ExtractError;
 pub use extractor::{Extractor, build_encoder};
 pub use fused::{FusedEncoder, mixed_int8_blocks};

@@ -1,17 +1,26 @@
 //! Learned positions at another grid than they were learned on.
 //!
-//! Separable bicubic interpolation with a = -0.75, half-pixel centres and replicated borders, to the exact grid, rows
-//! first: what current libraries do for DINOv2. Weights are built in f64 once per size.
+//! Separable bicubic interpolation with a = -0.75, half-pixel centres and replicated borders, to
+//! the exact grid, rows first: what current libraries do for DINOv2. Weights are built in f64 once
+//! per size.
 
-/// Interpolates the position table `[1 + from_rows * from_columns, dim]` (CLS first) to `[1 + rows * columns, dim]`.
-pub fn interpolate(table: &[f32], dim: usize, from: (usize, usize), to: (usize, usize)) -> Vec<f32> {
+/// Interpolates the position table `[1 + from_rows * from_columns, dim]` (CLS first) to `[1 + rows
+/// * columns, dim]`.
+pub fn interpolate(
+    table: &[f32],
+    dim: usize,
+    from: (usize, usize),
+    to: (usize, usize),
+) -> Vec<f32> {
     if from == to {
         return table.to_vec();
     }
     let (cls, patches) = table.split_at(dim);
     let ((from_rows, from_columns), (rows, columns)) = (from, to);
     let row_taps: Vec<_> = (0..rows).map(|row| taps(row, from_rows, rows)).collect();
-    let column_taps: Vec<_> = (0..columns).map(|column| taps(column, from_columns, columns)).collect();
+    let column_taps: Vec<_> = (0..columns)
+        .map(|column| taps(column, from_columns, columns))
+        .collect();
 
     let row_length = from_columns * dim;
     let mut stretched = vec![0f64; row_length];
@@ -21,12 +30,17 @@ pub fn interpolate(table: &[f32], dim: usize, from: (usize, usize), to: (usize, 
         stretched.fill(0.0);
         for &(source, weight) in row_tap {
             let source = &patches[source * row_length..][..row_length];
-            stretched.iter_mut().zip(source).for_each(|(sum, &value)| *sum += weight * value as f64);
+            stretched
+                .iter_mut()
+                .zip(source)
+                .for_each(|(sum, &value)| *sum += weight * value as f64);
         }
         for column_tap in &column_taps {
             out.extend((0..dim).map(|channel| {
-                column_tap.iter().map(|&(source, weight)| weight * stretched[source * dim + channel]).sum::<f64>()
-                    as f32
+                column_tap
+                    .iter()
+                    .map(|&(source, weight)| weight * stretched[source * dim + channel])
+                    .sum::<f64>() as f32
             }));
         }
     }
@@ -46,7 +60,11 @@ fn taps(index: usize, from: usize, to: usize) -> [(usize, f64); 4] {
 /// Keys' cubic kernel with a = -0.75 at distance `d` in 0..=2.
 fn cubic(d: f64) -> f64 {
     const A: f64 = -0.75;
-    if d <= 1.0 { ((A + 2.0) * d - (A + 3.0)) * d * d + 1.0 } else { ((A * d - 5.0 * A) * d + 8.0 * A) * d - 4.0 * A }
+    if d <= 1.0 {
+        ((A + 2.0) * d - (A + 3.0)) * d * d + 1.0
+    } else {
+        ((A * d - 5.0 * A) * d + 8.0 * A) * d - 4.0 * A
+    }
 }
 
 #[cfg(test)]
@@ -73,10 +91,15 @@ mod tests {
 
     #[test]
     fn rows_and_columns_are_not_swapped() {
-        let table: Vec<f32> = std::iter::once(0.0).chain((0..9).map(|i| (i / 3) as f32)).collect();
+        let table: Vec<f32> = std::iter::once(0.0)
+            .chain((0..9).map(|i| (i / 3) as f32))
+            .collect();
         let out = interpolate(&table, 1, (3, 3), (6, 2));
         for row in out[1..].chunks(2) {
-            assert!((row[0] - row[1]).abs() < 1e-6, "a table that varies by row only must stay so");
+            assert!(
+                (row[0] - row[1]).abs() < 1e-6,
+                "a table that varies by row only must stay so"
+            );
         }
         assert!(out[1] < out[11]);
     }

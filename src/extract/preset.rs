@@ -1,7 +1,8 @@
 //! Named model geometries: everything about a backbone that its weights do not say themselves.
 //!
-//! A preset fixes the shapes a weights file must have and the defaults that go with it: input size, exit block, and
-//! whether tokens pass the final LayerNorm (paper IV-A; the exit block of stock DINOv2 weights is our measurement).
+//! A preset fixes the shapes a weights file must have and the defaults that go with it: input size,
+//! exit block, and whether tokens pass the final LayerNorm (paper IV-A; the exit block of stock
+//! DINOv2 weights is our measurement).
 
 use crate::types::{ImageSize, InvalidValue};
 use serde::{Deserialize, Serialize};
@@ -54,13 +55,21 @@ impl Geometry {
 
     /// Columns and rows of patches in an image of `size`.
     pub fn grid(&self, size: ImageSize) -> (usize, usize) {
-        (size.width as usize / self.patch, size.height as usize / self.patch)
+        (
+            size.width as usize / self.patch,
+            size.height as usize / self.patch,
+        )
     }
 }
 
 impl Preset {
     /// Every preset.
-    pub const ALL: [Self; 4] = [Self::Dinov2Vits14, Self::Dinov2Vitb14, Self::Dinov2Vitl14, Self::PlaceformerVits16];
+    pub const ALL: [Self; 4] = [
+        Self::Dinov2Vits14,
+        Self::Dinov2Vitb14,
+        Self::Dinov2Vitl14,
+        Self::PlaceformerVits16,
+    ];
 
     /// Its name in settings and identities.
     pub fn name(self) -> &'static str {
@@ -78,34 +87,54 @@ impl Preset {
             Self::Dinov2Vits14 => "DINOv2 ViT-S/14, the default",
             Self::Dinov2Vitb14 => "DINOv2 ViT-B/14",
             Self::Dinov2Vitl14 => "DINOv2 ViT-L/14",
-            Self::PlaceformerVits16 => "the paper's ViT-S/16; no published weights: bring or train them",
+            Self::PlaceformerVits16 => {
+                "the paper's ViT-S/16; no published weights: bring or train them"
+            }
         }
     }
 
     /// Its shape.
     pub fn geometry(self) -> Geometry {
-        let dinov2 = |depth, dim, heads| Geometry { depth, dim, heads, patch: 14, mlp_dim: 4 * dim, layer_scale: true };
+        let dinov2 = |depth, dim, heads| Geometry {
+            depth,
+            dim,
+            heads,
+            patch: 14,
+            mlp_dim: 4 * dim,
+            layer_scale: true,
+        };
         match self {
             Self::Dinov2Vits14 => dinov2(12, 384, 6),
             Self::Dinov2Vitb14 => dinov2(12, 768, 12),
             Self::Dinov2Vitl14 => dinov2(24, 1024, 16),
-            Self::PlaceformerVits16 => {
-                Geometry { depth: 12, dim: 384, heads: 12, patch: 16, mlp_dim: 1536, layer_scale: false }
-            }
+            Self::PlaceformerVits16 => Geometry {
+                depth: 12,
+                dim: 384,
+                heads: 12,
+                patch: 16,
+                mlp_dim: 1536,
+                layer_scale: false,
+            },
         }
     }
 
-    /// The input size used unless another is set: the paper's 640x480, and 448x336 where stock weights do no better
-    /// with more.
+    /// The input size used unless another is set: the paper's 640x480, and 448x336 where stock
+    /// weights do no better with more.
     pub fn input_size(self) -> ImageSize {
         match self {
-            Self::PlaceformerVits16 => ImageSize { width: 640, height: 480 },
-            _ => ImageSize { width: 448, height: 336 },
+            Self::PlaceformerVits16 => ImageSize {
+                width: 640,
+                height: 480,
+            },
+            _ => ImageSize {
+                width: 448,
+                height: 336,
+            },
         }
     }
 
-    /// The 0-based block after which tokens are taken: three quarters of the way for stock weights, the last block for
-    /// weights trained for this purpose.
+    /// The 0-based block after which tokens are taken: three quarters of the way for stock weights,
+    /// the last block for weights trained for this purpose.
     pub fn exit_block(self) -> usize {
         match self {
             Self::PlaceformerVits16 => self.geometry().depth - 1,
@@ -128,17 +157,20 @@ impl Preset {
         }
     }
 
-    /// The content hash ([`VitWeights::content_hash`](super::VitWeights::content_hash)) of its published weights, where
-    /// something that ships depends on them bit for bit: the built-in head and calibration of the default do.
+    /// The content hash ([`VitWeights::content_hash`](super::VitWeights::content_hash)) of its
+    /// published weights, where something that ships depends on them bit for bit: the built-in head
+    /// and calibration of the default do.
     pub fn content_sha256(self) -> Option<&'static str> {
         match self {
-            Self::Dinov2Vits14 => Some("747267a07f39bc8916583ac2ee193ab2eaa34801a834e73fc97a5587c9e657f7"),
+            Self::Dinov2Vits14 => {
+                Some("747267a07f39bc8916583ac2ee193ab2eaa34801a834e73fc97a5587c9e657f7")
+            }
             Self::Dinov2Vitb14 | Self::Dinov2Vitl14 | Self::PlaceformerVits16 => None,
         }
     }
 
-    /// Rows and columns the learned position table may have: DINOv2's 37x37; for the paper's geometry any square (as
-    /// pre-trained) or the grid of the input it was trained at.
+    /// Rows and columns the learned position table may have: DINOv2's 37x37; for the paper's
+    /// geometry any square (as pre-trained) or the grid of the input it was trained at.
     pub fn position_grid(self, entries: usize) -> Option<(usize, usize)> {
         let side = entries.isqrt();
         let (columns, rows) = self.geometry().grid(self.input_size());
@@ -160,10 +192,16 @@ impl FromStr for Preset {
     type Err = InvalidValue;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        Self::ALL.into_iter().find(|preset| preset.name() == text).ok_or_else(|| {
-            let known: Vec<_> = Self::ALL.iter().map(|preset| preset.name()).collect();
-            InvalidValue::new("preset", format!("{text:?} is not one of {}", known.join(", ")))
-        })
+        Self::ALL
+            .into_iter()
+            .find(|preset| preset.name() == text)
+            .ok_or_else(|| {
+                let known: Vec<_> = Self::ALL.iter().map(|preset| preset.name()).collect();
+                InvalidValue::new(
+                    "preset",
+                    format!("{text:?} is not one of {}", known.join(", ")),
+                )
+            })
     }
 }
 
@@ -177,14 +215,26 @@ mod tests {
             assert_eq!(preset.name().parse::<Preset>().unwrap(), preset);
             assert_eq!(serde_json::to_value(preset).unwrap(), preset.name());
         }
-        assert!("dinov2".parse::<Preset>().unwrap_err().to_string().contains("dinov2-vits14"));
+        assert!(
+            "dinov2"
+                .parse::<Preset>()
+                .unwrap_err()
+                .to_string()
+                .contains("dinov2-vits14")
+        );
     }
 
     #[test]
     fn default_sizes_are_whole_patches_and_exits_exist() {
         for preset in Preset::ALL {
             let (geometry, size) = (preset.geometry(), preset.input_size());
-            assert_eq!((size.width as usize % geometry.patch, size.height as usize % geometry.patch), (0, 0));
+            assert_eq!(
+                (
+                    size.width as usize % geometry.patch,
+                    size.height as usize % geometry.patch
+                ),
+                (0, 0)
+            );
             assert!(preset.exit_block() < geometry.depth);
             assert_eq!(geometry.dim % geometry.heads, 0);
         }
@@ -196,7 +246,10 @@ mod tests {
         assert_eq!(Preset::Dinov2Vits14.position_grid(1369), Some((37, 37)));
         assert_eq!(Preset::Dinov2Vits14.position_grid(196), None);
         assert_eq!(Preset::PlaceformerVits16.position_grid(196), Some((14, 14)));
-        assert_eq!(Preset::PlaceformerVits16.position_grid(1200), Some((30, 40)));
+        assert_eq!(
+            Preset::PlaceformerVits16.position_grid(1200),
+            Some((30, 40))
+        );
         assert_eq!(Preset::PlaceformerVits16.position_grid(197), None);
     }
 }

@@ -1,7 +1,7 @@
 //! What is known about a fetched weights file: where it came from and the SHA-256 it must have.
 //!
-//! Kept beside the file as `<file>.json`. Weights that someone brings along have none and are checked by names and
-//! shapes only.
+//! Kept beside the file as `<file>.json`. Weights that someone brings along have none and are
+//! checked by names and shapes only.
 
 use super::error::ExtractError;
 use super::weights::{hash_file, with_suffix, write_atomically};
@@ -33,7 +33,10 @@ impl Record {
         match std::fs::read(&path) {
             Ok(bytes) => match serde_json::from_slice(&bytes) {
                 Ok(record) => Ok(Some(record)),
-                Err(e) => Err(ExtractError::BadFile { path, reason: format!("not a record of weights: {e}") }),
+                Err(e) => Err(ExtractError::BadFile {
+                    path,
+                    reason: format!("not a record of weights: {e}"),
+                }),
             },
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
             Err(e) => Err(ExtractError::io(path)(e)),
@@ -43,18 +46,26 @@ impl Record {
     /// Writes the record beside `weights`, atomically.
     pub fn save(&self, weights: &Path) -> Result<(), ExtractError> {
         let path = Self::path(weights);
-        let bytes = serde_json::to_vec_pretty(self)
-            .map_err(|e| ExtractError::BadFile { path: path.clone(), reason: e.to_string() })?;
+        let bytes = serde_json::to_vec_pretty(self).map_err(|e| ExtractError::BadFile {
+            path: path.clone(),
+            reason: e.to_string(),
+        })?;
         write_atomically(&path, &bytes)
     }
 }
 
 /// Refuses weights whose bytes are not those of their record.
 pub fn verify(weights: &Path) -> Result<Option<Record>, ExtractError> {
-    let Some(record) = Record::load(weights)? else { return Ok(None) };
+    let Some(record) = Record::load(weights)? else {
+        return Ok(None);
+    };
     let actual = hash_file(weights).map_err(ExtractError::io(weights))?;
     if actual != record.sha256 {
-        return Err(ExtractError::HashMismatch { path: weights.to_owned(), expected: record.sha256, actual });
+        return Err(ExtractError::HashMismatch {
+            path: weights.to_owned(),
+            expected: record.sha256,
+            actual,
+        });
     }
     Ok(Some(record))
 }

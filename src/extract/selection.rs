@@ -4,10 +4,17 @@ use super::fusion::{attention_map, average_pool, average_window};
 use super::global::l2_normalise;
 use crate::types::{KeyPatches, PatchGrid, SCALES, ScaleKeyPatches};
 
-/// Indices of at most `cap` values strictly above `tau`, by value descending, ties to the lower index.
+/// Indices of at most `cap` values strictly above `tau`, by value descending, ties to the lower
+/// index.
 pub fn select(attention: &[f32], cap: usize, tau: f32) -> Vec<u32> {
-    let mut order: Vec<u32> = (0..attention.len() as u32).filter(|&i| attention[i as usize] > tau).collect();
-    order.sort_by(|&a, &b| attention[b as usize].total_cmp(&attention[a as usize]).then(a.cmp(&b)));
+    let mut order: Vec<u32> = (0..attention.len() as u32)
+        .filter(|&i| attention[i as usize] > tau)
+        .collect();
+    order.sort_by(|&a, &b| {
+        attention[b as usize]
+            .total_cmp(&attention[a as usize])
+            .then(a.cmp(&b))
+    });
     order.truncate(cap);
     order
 }
@@ -33,7 +40,11 @@ pub fn key_patches(
             l2_normalise(descriptor);
         }
         let attention = index.iter().map(|&i| attention[i as usize]).collect();
-        ScaleKeyPatches { index, attention, descriptors }
+        ScaleKeyPatches {
+            index,
+            attention,
+            descriptors,
+        }
     });
     KeyPatches { grid, dim, scales }
 }

@@ -56,13 +56,24 @@ impl ExtractionTrace {
 
     /// All intermediates as named arrays, in the order in which they are computed.
     pub fn arrays(&self) -> Vec<TraceArray> {
-        let (n, dim, heads) = (self.encoded.grid.len(), self.encoded.dim, self.encoded.heads);
+        let (n, dim, heads) = (
+            self.encoded.grid.len(),
+            self.encoded.dim,
+            self.encoded.heads,
+        );
         let size = self.image.size;
         let last = |block: usize| block + 1 == self.depth;
-        let norm = if self.spec.token_norm { "normed" } else { "prenorm" };
+        let norm = if self.spec.token_norm {
+            "normed"
+        } else {
+            "prenorm"
+        };
         let (exit, tag) = match self.spec.exit_block {
             block if last(block) => (format!("last_tokens_{norm}"), "last".to_owned()),
-            block if self.spec.token_norm => (format!("block{block}_tokens_normed"), format!("exit{block}_normed")),
+            block if self.spec.token_norm => (
+                format!("block{block}_tokens_normed"),
+                format!("exit{block}_normed"),
+            ),
             block => (format!("block{block}_tokens"), format!("exit{block}")),
         };
         let attention = match self.spec.attention_block {
@@ -81,12 +92,24 @@ impl ExtractionTrace {
         };
         let tokens = [&self.encoded.cls_token[..], &self.encoded.tokens[..]].concat();
         let mut all = vec![
-            floats("pixels".into(), &[3, size.height as usize, size.width as usize], &self.image.data),
+            floats(
+                "pixels".into(),
+                &[3, size.height as usize, size.width as usize],
+                &self.image.data,
+            ),
             integers("rows".into(), (0..=n as i64).collect()),
             floats("positions_rows".into(), &[1 + n, dim], &self.positions),
             floats(format!("{exit}_rows"), &[1 + n, dim], &tokens),
-            floats(format!("cls_attention_{attention}_heads"), &[heads, n], &self.encoded.cls_attention),
-            floats("attention_map".into(), &[self.encoded.grid.rows, self.encoded.grid.columns], &self.attention),
+            floats(
+                format!("cls_attention_{attention}_heads"),
+                &[heads, n],
+                &self.encoded.cls_attention,
+            ),
+            floats(
+                "attention_map".into(),
+                &[self.encoded.grid.rows, self.encoded.grid.columns],
+                &self.attention,
+            ),
             floats(
                 format!("global_{}_{}_l2", self.pooling, exit.replace("_tokens", "")),
                 &[self.pooled.len()],
@@ -96,11 +119,30 @@ impl ExtractionTrace {
         ];
         for (scale, keys) in (1..).zip(&self.key_patches.scales) {
             let m = keys.index.len();
-            let centres: Vec<f32> = keys.index.iter().flat_map(|&i| self.grid().centre(scale, i as usize)).collect();
-            all.push(integers(format!("{tag}_key{scale}_index"), keys.index.iter().map(|&i| i as i64).collect()));
-            all.push(floats(format!("{tag}_key{scale}_attention"), &[m], &keys.attention));
-            all.push(floats(format!("{tag}_key{scale}_centre_xy"), &[m, 2], &centres));
-            all.push(floats(format!("{tag}_key{scale}_descriptor"), &[m, dim], &keys.descriptors));
+            let centres: Vec<f32> = keys
+                .index
+                .iter()
+                .flat_map(|&i| self.grid().centre(scale, i as usize))
+                .collect();
+            all.push(integers(
+                format!("{tag}_key{scale}_index"),
+                keys.index.iter().map(|&i| i as i64).collect(),
+            ));
+            all.push(floats(
+                format!("{tag}_key{scale}_attention"),
+                &[m],
+                &keys.attention,
+            ));
+            all.push(floats(
+                format!("{tag}_key{scale}_centre_xy"),
+                &[m, 2],
+                &centres,
+            ));
+            all.push(floats(
+                format!("{tag}_key{scale}_descriptor"),
+                &[m, dim],
+                &keys.descriptors,
+            ));
         }
         all
     }

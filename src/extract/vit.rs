@@ -1,8 +1,9 @@
 //! The vision transformer in candle: the reference implementation of [`Encoder`], in 32-bit floats.
 //!
-//! Patch embedding, interpolated positions, then pre-norm blocks up to the last one the spec needs (paper III-A). Images
-//! of a batch go through one by one, so that a batch equals its single images bit for bit; the threads work inside each
-//! product. Plain candle ops except GELU, whose scalar error function would cost a tenth of the time.
+//! Patch embedding, interpolated positions, then pre-norm blocks up to the last one the spec needs
+//! (paper III-A). Images of a batch go through one by one, so that a batch equals its single images
+//! bit for bit; the threads work inside each product. Plain candle ops except GELU, whose scalar
+//! error function would cost a tenth of the time.
 
 use super::activation;
 use super::encoder::{EncodedImage, Encoder, EncoderSpec, TokenGrid, check_image, token_grid};
@@ -80,12 +81,25 @@ struct Pass {
 
 impl CandleEncoder {
     /// Copies the weights of the blocks that `spec` needs; positions are interpolated here, once.
-    pub fn new(weights: &VitWeights, spec: &EncoderSpec) -> std::result::Result<Self, ExtractError> {
+    pub fn new(
+        weights: &VitWeights,
+        spec: &EncoderSpec,
+    ) -> std::result::Result<Self, ExtractError> {
         let geometry = weights.geometry;
         let grid = token_grid(&geometry, spec);
         let (dim, patch) = (geometry.dim, geometry.patch);
-        let table = positions::interpolate(&weights.positions, dim, weights.position_grid, (grid.rows, grid.columns));
-        let cls: Vec<f32> = weights.cls_token.iter().zip(&table[..dim]).map(|(token, at)| token + at).collect();
+        let table = positions::interpolate(
+            &weights.positions,
+            dim,
+            weights.position_grid,
+            (grid.rows, grid.columns),
+        );
+        let cls: Vec<f32> = weights
+            .cls_token
+            .iter()
+            .zip(&table[..dim])
+            .map(|(token, at)| token + at)
+            .collect();
         Ok(Self {
             spec: *spec,
             geometry,
@@ -93,13 +107,16 @@ impl CandleEncoder {
             patch_embed: Dense::new(&weights.patch_embed, 3 * patch * patch)?,
             cls: tensor(&cls, &[1, dim])?,
             positions: tensor(&table[dim..], &[grid.len(), dim])?,
-            blocks: weights.blocks[..spec.blocks()].iter().map(|b| Block::new(b, &geometry)).collect::<Result<_>>()?,
+            blocks: weights.blocks[..spec.blocks()]
+                .iter()
+                .map(|b| Block::new(b, &geometry))
+                .collect::<Result<_>>()?,
             norm: LayerNorm::new(&weights.norm)?,
         })
     }
 
-    /// Runs the transformer for what goes into its linear layers: `record(layer, inputs)`, `[1 + n, width]`, one
-    /// block after the other.
+    /// Runs the transformer for what goes into its linear layers: `record(layer, inputs)`, `[1 + n,
+    /// width]`, one block after the other.
     ///
     /// # Errors
     /// The image's size, or candle's.
@@ -117,7 +134,13 @@ impl CandleEncoder {
     }
 
     fn run(&self, image: &ImageTensor, record: Record<'_>) -> Result<Pass> {
-        let patches = tensor(&self.patches(image), &[self.grid.len(), 3 * self.geometry.patch * self.geometry.patch])?;
+        let patches = tensor(
+            &self.patches(image),
+            &[
+                self.grid.len(),
+                3 * self.geometry.patch * self.geometry.patch,
+            ],
+        )?;
         let embedded = (self.patch_embed.forward(&patches)? + &self.positions)?;
         let mut x = Tensor::cat(&[&self.cls, &embedded], 0)?;
         let (mut tokens, mut cls_attention) = (None, None);
@@ -133,11 +156,18 @@ impl CandleEncoder {
                 cls_attention = Some(attention);
             }
             if i == self.spec.exit_block {
-                tokens = Some(if self.spec.token_norm { self.norm.forward(&x)? } else { x.clone() });
+                tokens = Some(if self.spec.token_norm {
+                    self.norm.forward(&x)?
+                } else {
+                    x.clone()
+                });
             }
         }
         match (tokens, cls_attention) {
-            (Some(tokens), Some(cls_attention)) => Ok(Pass { tokens, cls_attention }),
+            (Some(tokens), Some(cls_attention)) => Ok(Pass {
+                tokens,
+                cls_attention,
+            }),
             _ => candle_core::bail!("the encoder holds too few blocks for its own spec"),
         }
     }
@@ -147,7 +177,9 @@ impl CandleEncoder {
         let patch = self.geometry.patch;
         let (width, height) = (image.size.width as usize, image.size.height as usize);
         let mut out = Vec::with_capacity(image.data.len());
-        for (row, column) in (0..self.grid.rows).flat_map(|r| (0..self.grid.columns).map(move |c| (r, c))) {
+        for (row, column) in
+            (0..self.grid.rows).flat_map(|r| (0..self.grid.columns).map(move |c| (r, c)))
+        {
             for (channel, y) in (0..3).flat_map(|channel| (0..patch).map(move |y| (channel, y))) {
                 let start = (channel * height + row * patch + y) * width + column * patch;
                 out.extend_from_slice(&image.data[start..start + patch]);
@@ -168,13 +200,26 @@ impl Encoder for CandleEncoder {
 
     fn weight_bytes(&self) -> usize {
         let dense = |layer: &Dense| layer.weight.elem_count() + layer.bias.elem_count();
-        let blocks: usize =
-            self.blocks.iter().map(|b| [&b.qkv, &b.proj, &b.fc1, &b.fc2].map(dense).iter().sum::<usize>()).sum();
+        let blocks: usize = self
+            .blocks
+            .iter()
+            .map(|b| {
+                [&b.qkv, &b.proj, &b.fc1, &b.fc2]
+                    .map(dense)
+                    .iter()
+                    .sum::<usize>()
+            })
+            .sum();
         4 * (blocks + dense(&self.patch_embed) + self.positions.elem_count())
     }
 
-    fn encode(&self, images: &[ImageTensor]) -> std::result::Result<Vec<EncodedImage>, ExtractError> {
-        images.iter().try_for_each(|image| check_image(image, &self.spec))?;
+    fn encode(
+        &self,
+        images: &[ImageTensor],
+    ) -> std::result::Result<Vec<EncodedImage>, ExtractError> {
+        images
+            .iter()
+            .try_for_each(|image| check_image(image, &self.spec))?;
         images
             .iter()
             .map(|image| {
@@ -197,7 +242,8 @@ impl Encoder for CandleEncoder {
 impl Block {
     fn new(weights: &BlockWeights, geometry: &Geometry) -> Result<Self> {
         let (dim, mlp_dim) = (geometry.dim, geometry.mlp_dim);
-        let scale = |scale: &Option<Vec<f32>>| scale.as_ref().map(|s| tensor(s, &[s.len()])).transpose();
+        let scale =
+            |scale: &Option<Vec<f32>>| scale.as_ref().map(|s| tensor(s, &[s.len()])).transpose();
         Ok(Self {
             norm1: LayerNorm::new(&weights.norm1)?,
             qkv: Dense::new(&weights.qkv, dim)?,
@@ -210,14 +256,23 @@ impl Block {
         })
     }
 
-    /// The block's output `[1 + n, d]` and its CLS attention `[heads, n]`; `record` sees what its layers are given.
-    fn forward(&self, x: &Tensor, geometry: &Geometry, record: Record<'_>) -> Result<(Tensor, Tensor)> {
+    /// The block's output `[1 + n, d]` and its CLS attention `[heads, n]`; `record` sees what its
+    /// layers are given.
+    fn forward(
+        &self,
+        x: &Tensor,
+        geometry: &Geometry,
+        record: Record<'_>,
+    ) -> Result<(Tensor, Tensor)> {
         let (length, dim) = x.dims2()?;
         let normed = self.norm1.forward(x)?;
         record(BlockLayer::Qkv, &normed)?;
         let [q, k, v] = self.queries_keys_values(&normed, geometry)?;
         let attention = softmax_last_dim(&q.matmul(&k)?)?;
-        let mixed = attention.matmul(&v)?.transpose(0, 1)?.reshape((length, dim))?;
+        let mixed = attention
+            .matmul(&v)?
+            .transpose(0, 1)?
+            .reshape((length, dim))?;
         record(BlockLayer::Proj, &mixed)?;
         let x = residual(x, self.proj.forward(&mixed)?, &self.layer_scale1)?;
         let normed = self.norm2.forward(&x)?;
@@ -232,15 +287,21 @@ impl Block {
     /// The CLS attention `[heads, n]` alone.
     fn cls_attention(&self, x: &Tensor, geometry: &Geometry) -> Result<Tensor> {
         let [q, k, _] = self.queries_keys_values(&self.norm1.forward(x)?, geometry)?;
-        patch_keys(&softmax_last_dim(&q.narrow(1, 0, 1)?.contiguous()?.matmul(&k)?)?)
+        patch_keys(&softmax_last_dim(
+            &q.narrow(1, 0, 1)?.contiguous()?.matmul(&k)?,
+        )?)
     }
 
-    /// Scaled queries `[heads, length, d / heads]`, keys transposed `[heads, d / heads, length]`, values as queries.
+    /// Scaled queries `[heads, length, d / heads]`, keys transposed `[heads, d / heads, length]`,
+    /// values as queries.
     fn queries_keys_values(&self, normed: &Tensor, geometry: &Geometry) -> Result<[Tensor; 3]> {
         let (length, dim) = normed.dims2()?;
         let fused = self.qkv.forward(normed)?;
         let part = |index: usize| {
-            fused.narrow(1, index * dim, dim)?.reshape((length, geometry.heads, geometry.head_dim()))?.transpose(0, 1)
+            fused
+                .narrow(1, index * dim, dim)?
+                .reshape((length, geometry.heads, geometry.head_dim()))?
+                .transpose(0, 1)
         };
         let scale = (geometry.head_dim() as f64).powf(-0.5);
         let q = (part(0)? * scale)?.contiguous()?;
@@ -252,7 +313,11 @@ impl Block {
 /// The first query's attention over all keys but the first: `[heads, *, 1 + n]` -> `[heads, n]`.
 fn patch_keys(attention: &Tensor) -> Result<Tensor> {
     let keys = attention.dim(D::Minus1)?;
-    attention.narrow(1, 0, 1)?.squeeze(1)?.narrow(1, 1, keys - 1)?.contiguous()
+    attention
+        .narrow(1, 0, 1)?
+        .squeeze(1)?
+        .narrow(1, 1, keys - 1)?
+        .contiguous()
 }
 
 /// x + branch * scale.
@@ -280,7 +345,10 @@ impl Dense {
 impl LayerNorm {
     fn new(norm: &Norm) -> Result<Self> {
         let dim = norm.weight.len();
-        Ok(Self { weight: tensor(&norm.weight, &[dim])?, bias: tensor(&norm.bias, &[dim])? })
+        Ok(Self {
+            weight: tensor(&norm.weight, &[dim])?,
+            bias: tensor(&norm.bias, &[dim])?,
+        })
     }
 
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
@@ -301,10 +369,13 @@ impl InplaceOp1 for Gelu {
     }
 
     fn cpu_fwd(&self, storage: &mut CpuStorage, layout: &Layout) -> Result<()> {
-        let (CpuStorage::F32(values), Some((start, end))) = (storage, layout.contiguous_offsets()) else {
+        let (CpuStorage::F32(values), Some((start, end))) = (storage, layout.contiguous_offsets())
+        else {
             candle_core::bail!("gelu-erf takes contiguous f32 tensors");
         };
-        values[start..end].par_chunks_mut(1 << 14).for_each(activation::gelu);
+        values[start..end]
+            .par_chunks_mut(1 << 14)
+            .for_each(activation::gelu);
         Ok(())
     }
 }

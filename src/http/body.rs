@@ -1,11 +1,12 @@
 //! Bodies: bounded and timed while they arrive, then taken apart into images and parameters.
 //!
-//! An image comes in one of three ways: as the raw body with parameters in the query string; as multipart, with
-//! parameters in a part named `json` or in the query string; as JSON with the image in base64 beside the parameters.
+//! An image comes in one of three ways: as the raw body with parameters in the query string; as
+//! multipart, with parameters in a part named `json` or in the query string; as JSON with the image
+//! in base64 beside the parameters.
 //!
-//! Whatever memory a body takes on its way is taken from one budget first: the buffer it arrives in, and the images
-//! copied or decoded out of it. The images then carry their share along, so that it is given back when the pipeline
-//! is done with them, also when the client has left meanwhile.
+//! Whatever memory a body takes on its way is taken from one budget first: the buffer it arrives
+//! in, and the images copied or decoded out of it. The images then carry their share along, so that
+//! it is given back when the pipeline is done with them, also when the client has left meanwhile.
 
 use super::AppState;
 use super::limits::Held;
@@ -39,7 +40,8 @@ const PIECE: usize = 64 << 10;
 /// Largest body without an image.
 const MAX_JSON_BYTES: usize = 256 << 10;
 
-/// Images and parameters of one request. An image counts against the budget until the last clone of it is dropped.
+/// Images and parameters of one request. An image counts against the budget until the last clone of
+/// it is dropped.
 pub struct Upload<P> {
     images: HashMap<&'static str, Bytes>,
     /// The parameters, wherever they came from.
@@ -63,15 +65,17 @@ struct Parts {
 impl<P> Upload<P> {
     /// Takes the image called `name`.
     pub fn take(&mut self, name: &'static str) -> Result<Bytes, ApiError> {
-        self.take_optional(name)?.ok_or_else(|| ApiError::invalid(format!("the image {name:?} is missing")))
+        self.take_optional(name)?
+            .ok_or_else(|| ApiError::invalid(format!("the image {name:?} is missing")))
     }
 
     /// Takes the image called `name`, if it was sent.
     pub fn take_optional(&mut self, name: &'static str) -> Result<Option<Bytes>, ApiError> {
         match self.images.remove(name) {
-            Some(bytes) if bytes.is_empty() => {
-                Err(ApiError::new(ErrorCode::EmptyImage, format!("the image {name:?} has no bytes")))
-            }
+            Some(bytes) if bytes.is_empty() => Err(ApiError::new(
+                ErrorCode::EmptyImage,
+                format!("the image {name:?} has no bytes"),
+            )),
             found => Ok(found),
         }
     }
@@ -94,14 +98,19 @@ pub async fn read_upload<P: DeserializeOwned>(
             finish(parts, held, &uri)
         }
         Some("application/json") => {
-            let received = read_bytes(state, request, image_bytes / 3 * 4 + BESIDE_THE_IMAGE).await?;
+            let received =
+                read_bytes(state, request, image_bytes / 3 * 4 + BESIDE_THE_IMAGE).await?;
             let (parts, held) = split_json(received, names)?;
             finish(parts, held, &uri)
         }
         Some("image/jpeg" | "image/png" | "image/webp" | "application/octet-stream") => {
             let params = one_source(&uri, None)?;
-            let Received { bytes, held } = read_bytes(state, request, state.max_image_bytes).await?;
-            Ok(Upload { images: names.iter().copied().zip(held.keep(vec![bytes])).collect(), params })
+            let Received { bytes, held } =
+                read_bytes(state, request, state.max_image_bytes).await?;
+            Ok(Upload {
+                images: names.iter().copied().zip(held.keep(vec![bytes])).collect(),
+                params,
+            })
         }
         other => Err(ApiError::new(
             ErrorCode::UnsupportedMediaType,
@@ -115,10 +124,19 @@ pub async fn read_upload<P: DeserializeOwned>(
 }
 
 /// Reads a JSON body without images.
-pub async fn read_json<T: DeserializeOwned>(state: &AppState, request: Request) -> Result<T, ApiError> {
+pub async fn read_json<T: DeserializeOwned>(
+    state: &AppState,
+    request: Request,
+) -> Result<T, ApiError> {
     let kind = media_type(request.headers());
-    if !matches!(kind.as_deref(), Some("application/json" | "application/merge-patch+json")) {
-        let detail = format!("content-type {} is not application/json", kind.as_deref().unwrap_or("(none)"));
+    if !matches!(
+        kind.as_deref(),
+        Some("application/json" | "application/merge-patch+json")
+    ) {
+        let detail = format!(
+            "content-type {} is not application/json",
+            kind.as_deref().unwrap_or("(none)")
+        );
         return Err(ApiError::new(ErrorCode::UnsupportedMediaType, detail));
     }
     let Received { bytes, held: _held } = read_bytes(state, request, MAX_JSON_BYTES).await?;
@@ -127,11 +145,19 @@ pub async fn read_json<T: DeserializeOwned>(state: &AppState, request: Request) 
     serde_json::from_value(Value::Object(object)).map_err(json_error)
 }
 
-/// Reads a body that is one file of at most `limit` bytes; they count against the budget until they are dropped.
-pub async fn read_file(state: &AppState, request: Request, limit: usize) -> Result<Bytes, ApiError> {
+/// Reads a body that is one file of at most `limit` bytes; they count against the budget until they
+/// are dropped.
+pub async fn read_file(
+    state: &AppState,
+    request: Request,
+    limit: usize,
+) -> Result<Bytes, ApiError> {
     let kind = media_type(request.headers());
     if kind.as_deref() != Some("application/octet-stream") {
-        let detail = format!("content-type {} is not application/octet-stream", kind.as_deref().unwrap_or("(none)"));
+        let detail = format!(
+            "content-type {} is not application/octet-stream",
+            kind.as_deref().unwrap_or("(none)")
+        );
         return Err(ApiError::new(ErrorCode::UnsupportedMediaType, detail));
     }
     let Received { bytes, held } = read_bytes(state, request, limit).await?;
@@ -140,7 +166,9 @@ pub async fn read_file(state: &AppState, request: Request, limit: usize) -> Resu
 
 /// Parses the query string; unknown names are refused by the type.
 pub fn read_query<T: DeserializeOwned>(uri: &Uri) -> Result<T, ApiError> {
-    Query::try_from_uri(uri).map(|Query(value)| value).map_err(|rejection| ApiError::invalid(rejection.body_text()))
+    Query::try_from_uri(uri)
+        .map(|Query(value)| value)
+        .map_err(|rejection| ApiError::invalid(rejection.body_text()))
 }
 
 fn media_type(headers: &HeaderMap) -> Option<String> {
@@ -149,26 +177,48 @@ fn media_type(headers: &HeaderMap) -> Option<String> {
 }
 
 /// Buffers a body of at most `limit` bytes within the body timeouts and the budget.
-async fn read_bytes(state: &AppState, request: Request, limit: usize) -> Result<Received, ApiError> {
-    let too_large = || ApiError::new(ErrorCode::BodyTooLarge, format!("the body has more than {limit} bytes"));
+async fn read_bytes(
+    state: &AppState,
+    request: Request,
+    limit: usize,
+) -> Result<Received, ApiError> {
+    let too_large = || {
+        ApiError::new(
+            ErrorCode::BodyTooLarge,
+            format!("the body has more than {limit} bytes"),
+        )
+    };
     let mut body = request.into_body();
     let announced = HttpBody::size_hint(&body);
     if announced.lower() > limit as u64 {
         return Err(too_large());
     }
-    let most = announced.upper().and_then(|upper| usize::try_from(upper).ok()).map_or(limit, |upper| upper.min(limit));
+    let most = announced
+        .upper()
+        .and_then(|upper| usize::try_from(upper).ok())
+        .map_or(limit, |upper| upper.min(limit));
     let whole = Instant::now() + Duration::from_millis(state.http.body_timeout_ms);
     let pause = Duration::from_millis(state.http.body_idle_timeout_ms);
-    let mut received = Received { bytes: Vec::new(), held: state.body_memory.hold()? };
+    let mut received = Received {
+        bytes: Vec::new(),
+        held: state.body_memory.hold()?,
+    };
     loop {
         let frame = timeout_at(whole, timeout(pause, body.frame())).await;
-        let frame = frame
-            .ok()
-            .and_then(Result::ok)
-            .ok_or_else(|| ApiError::new(ErrorCode::RequestTimeout, "the body stopped arriving or took too long"))?;
-        let Some(frame) = frame else { return Ok(received) };
-        let frame = frame.map_err(|error| ApiError::malformed(format!("the body broke off: {error}")))?;
-        let Ok(data) = frame.into_data() else { continue };
+        let frame = frame.ok().and_then(Result::ok).ok_or_else(|| {
+            ApiError::new(
+                ErrorCode::RequestTimeout,
+                "the body stopped arriving or took too long",
+            )
+        })?;
+        let Some(frame) = frame else {
+            return Ok(received);
+        };
+        let frame =
+            frame.map_err(|error| ApiError::malformed(format!("the body broke off: {error}")))?;
+        let Ok(data) = frame.into_data() else {
+            continue;
+        };
         if received.bytes.len() + data.len() > limit {
             return Err(too_large());
         }
@@ -177,8 +227,8 @@ async fn read_bytes(state: &AppState, request: Request, limit: usize) -> Result<
 }
 
 impl Received {
-    /// Appends to the buffer, which doubles as bytes come, but not beyond the `most` that can come: what a client only
-    /// announces costs nothing.
+    /// Appends to the buffer, which doubles as bytes come, but not beyond the `most` that can come:
+    /// what a client only announces costs nothing.
     fn append(&mut self, data: &[u8], most: usize) -> Result<(), ApiError> {
         let (needed, capacity) = (self.bytes.len() + data.len(), self.bytes.capacity());
         if needed > capacity {
@@ -194,11 +244,18 @@ impl Received {
 }
 
 /// Hands the images over with the room they take.
-fn finish<P: DeserializeOwned>(parts: Parts, mut held: Held, uri: &Uri) -> Result<Upload<P>, ApiError> {
+fn finish<P: DeserializeOwned>(
+    parts: Parts,
+    mut held: Held,
+    uri: &Uri,
+) -> Result<Upload<P>, ApiError> {
     let (names, images): (Vec<_>, Vec<_>) = parts.images.into_iter().unzip();
     held.resize(images.iter().map(Vec::capacity).sum())?;
     let images = names.into_iter().zip(held.keep(images)).collect();
-    Ok(Upload { images, params: one_source(uri, parts.json)? })
+    Ok(Upload {
+        images,
+        params: one_source(uri, parts.json)?,
+    })
 }
 
 async fn split_multipart(
@@ -213,13 +270,25 @@ async fn split_multipart(
     let mut request = Request::new(in_pieces(Bytes::from(bytes)));
     *request.headers_mut() = headers;
     axum::extract::DefaultBodyLimit::disable().apply(&mut request);
-    let broken = |error: &dyn std::fmt::Display| ApiError::malformed(format!("the multipart body is broken: {error}"));
-    let mut multipart = Multipart::from_request(request, &()).await.map_err(|error| broken(&error.body_text()))?;
+    let broken = |error: &dyn std::fmt::Display| {
+        ApiError::malformed(format!("the multipart body is broken: {error}"))
+    };
+    let mut multipart = Multipart::from_request(request, &())
+        .await
+        .map_err(|error| broken(&error.body_text()))?;
     let mut parts = Parts::default();
-    while let Some(mut field) = multipart.next_field().await.map_err(|error| broken(&error.body_text()))? {
+    while let Some(mut field) = multipart
+        .next_field()
+        .await
+        .map_err(|error| broken(&error.body_text()))?
+    {
         let name = field.name().unwrap_or_default().to_owned();
         let mut content = Vec::with_capacity(left);
-        while let Some(chunk) = field.chunk().await.map_err(|error| broken(&error.body_text()))? {
+        while let Some(chunk) = field
+            .chunk()
+            .await
+            .map_err(|error| broken(&error.body_text()))?
+        {
             content.extend_from_slice(&chunk);
         }
         content.shrink_to_fit();
@@ -232,16 +301,21 @@ async fn split_multipart(
             repeated
         } else {
             let name: String = name.chars().take(80).collect();
-            return Err(ApiError::invalid(format!("the part {name:?} is not known; use {names:?} and \"json\"")));
+            return Err(ApiError::invalid(format!(
+                "the part {name:?} is not known; use {names:?} and \"json\""
+            )));
         };
         if repeated {
-            return Err(ApiError::invalid(format!("the part {name:?} was sent twice")));
+            return Err(ApiError::invalid(format!(
+                "the part {name:?} was sent twice"
+            )));
         }
     }
     Ok((parts, held))
 }
 
-/// The JSON part. Once parsed, JSON takes many times its length, so it may not be as long as an image.
+/// The JSON part. Once parsed, JSON takes many times its length, so it may not be as long as an
+/// image.
 fn parameters(content: &[u8]) -> Result<Map<String, Value>, ApiError> {
     if content.len() > BESIDE_THE_IMAGE {
         return Err(too_many_parameters());
@@ -256,7 +330,8 @@ fn too_many_parameters() -> ApiError {
     )
 }
 
-/// A body that comes bit by bit: the parser copies what it is given, and so never holds more than a piece.
+/// A body that comes bit by bit: the parser copies what it is given, and so never holds more than a
+/// piece.
 fn in_pieces(mut rest: Bytes) -> Body {
     let pieces = std::iter::from_fn(move || {
         let piece = rest.split_to(rest.len().min(PIECE));
@@ -265,7 +340,10 @@ fn in_pieces(mut rest: Bytes) -> Body {
     Body::from_stream(futures_util::stream::iter(pieces))
 }
 
-fn split_json(received: Received, names: &'static [&'static str]) -> Result<(Parts, Held), ApiError> {
+fn split_json(
+    received: Received,
+    names: &'static [&'static str],
+) -> Result<(Parts, Held), ApiError> {
     let Received { bytes, mut held } = received;
     let sent = SentJson::parse(&bytes, names)?;
     let mut parts = Parts::default();
@@ -273,7 +351,9 @@ fn split_json(received: Received, names: &'static [&'static str]) -> Result<(Par
     for (name, raw) in sent.images {
         let text = raw.get();
         if !text.starts_with('"') {
-            return Err(ApiError::invalid(format!("{name}: it must be a string of base64")));
+            return Err(ApiError::invalid(format!(
+                "{name}: it must be a string of base64"
+            )));
         }
         // Base64 needs no escapes, but some writers escape its slashes.
         let escaped = text.contains('\\');
@@ -284,16 +364,22 @@ fn split_json(received: Received, names: &'static [&'static str]) -> Result<(Par
         } else {
             Cow::Borrowed(text.trim_matches('"'))
         };
-        let image = STANDARD.decode(text.as_ref()).map_err(|error| ApiError::invalid(format!("{name}: {error}")))?;
+        let image = STANDARD
+            .decode(text.as_ref())
+            .map_err(|error| ApiError::invalid(format!("{name}: {error}")))?;
         parts.images.push((name, image));
     }
-    let json: Result<Map<_, _>, _> =
-        sent.beside.into_iter().map(|(key, raw)| Ok((key, serde_json::from_str(raw.get())?))).collect();
+    let json: Result<Map<_, _>, _> = sent
+        .beside
+        .into_iter()
+        .map(|(key, raw)| Ok((key, serde_json::from_str(raw.get())?)))
+        .collect();
     parts.json = Some(json.map_err(json_error)?);
     Ok((parts, held))
 }
 
-/// A JSON body looked at, but not copied: images are long, and parsed JSON takes many times its length.
+/// A JSON body looked at, but not copied: images are long, and parsed JSON takes many times its
+/// length.
 struct SentJson<'a> {
     images: HashMap<&'static str, &'a RawValue>,
     beside: Vec<(String, &'a RawValue)>,
@@ -302,7 +388,9 @@ struct SentJson<'a> {
 impl<'a> SentJson<'a> {
     fn parse(bytes: &'a [u8], names: &'static [&'static str]) -> Result<Self, ApiError> {
         let mut deserializer = serde_json::Deserializer::from_slice(bytes);
-        let sent = deserializer.deserialize_map(ImagesApart(names)).map_err(json_error)?;
+        let sent = deserializer
+            .deserialize_map(ImagesApart(names))
+            .map_err(json_error)?;
         deserializer.end().map_err(json_error)?;
         sent.ok_or_else(too_many_parameters)
     }
@@ -319,7 +407,10 @@ impl<'de> Visitor<'de> for ImagesApart {
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<Self::Value, A::Error> {
-        let mut sent = SentJson { images: HashMap::new(), beside: Vec::new() };
+        let mut sent = SentJson {
+            images: HashMap::new(),
+            beside: Vec::new(),
+        };
         let mut room = Some(BESIDE_THE_IMAGE);
         while let Some((key, value)) = members.next_entry::<String, &RawValue>()? {
             if let Some(&name) = self.0.iter().find(|name| **name == key) {
@@ -336,12 +427,15 @@ impl<'de> Visitor<'de> for ImagesApart {
 }
 
 /// Parameters come from the query string or from JSON, not from both.
-fn one_source<P: DeserializeOwned>(uri: &Uri, json: Option<Map<String, Value>>) -> Result<P, ApiError> {
+fn one_source<P: DeserializeOwned>(
+    uri: &Uri,
+    json: Option<Map<String, Value>>,
+) -> Result<P, ApiError> {
     let in_query = uri.query().is_some_and(|query| !query.is_empty());
     match json {
-        Some(json) if !json.is_empty() && in_query => {
-            Err(ApiError::invalid("parameters are in the query string and in JSON; use one of them"))
-        }
+        Some(json) if !json.is_empty() && in_query => Err(ApiError::invalid(
+            "parameters are in the query string and in JSON; use one of them",
+        )),
         Some(json) if !in_query => serde_json::from_value(Value::Object(json)).map_err(json_error),
         _ => read_query(uri),
     }
@@ -349,5 +443,9 @@ fn one_source<P: DeserializeOwned>(uri: &Uri, json: Option<Map<String, Value>>) 
 
 /// JSON that cannot be parsed is malformed; JSON that says the wrong thing is invalid.
 fn json_error(error: serde_json::Error) -> ApiError {
-    if error.is_data() { ApiError::invalid(error.to_string()) } else { ApiError::malformed(error.to_string()) }
+    if error.is_data() {
+        ApiError::invalid(error.to_string())
+    } else {
+        ApiError::malformed(error.to_string())
+    }
 }

@@ -11,7 +11,8 @@ pub struct HttpConfig {
     pub listen: String,
     /// Connections open at once; further ones wait in the kernel's backlog.
     pub max_connections: usize,
-    /// Time for a request's head to arrive, also between two requests of one connection, in milliseconds.
+    /// Time for a request's head to arrive, also between two requests of one connection, in
+    /// milliseconds.
     pub header_timeout_ms: u64,
     /// Time for a whole body to arrive, in milliseconds.
     pub body_timeout_ms: u64,
@@ -23,7 +24,8 @@ pub struct HttpConfig {
     pub max_buffered_bytes: usize,
     /// Most references in one page of a listing.
     pub max_page: usize,
-    /// Time between failing readiness and refusing connections, in milliseconds: a balancer notices meanwhile.
+    /// Time between failing readiness and refusing connections, in milliseconds: a balancer notices
+    /// meanwhile.
     pub drain_delay_ms: u64,
     /// Time for requests under way to finish when stopping, in milliseconds.
     pub drain_timeout_ms: u64,
@@ -61,7 +63,10 @@ impl HttpConfig {
             return Err(InvalidValue::new(field, "0 would refuse everything"));
         }
         if self.max_header_bytes < 8 << 10 {
-            return Err(InvalidValue::new("http.max_header_bytes", "use at least 8192"));
+            return Err(InvalidValue::new(
+                "http.max_header_bytes",
+                "use at least 8192",
+            ));
         }
         Ok(())
     }
@@ -112,7 +117,10 @@ impl AuthConfig {
         let mut names = std::collections::HashSet::new();
         for key in &self.keys {
             if key.name.is_empty() || !names.insert(&key.name) {
-                return Err(InvalidValue::new("auth.keys", format!("the name {:?} is empty or used twice", key.name)));
+                return Err(InvalidValue::new(
+                    "auth.keys",
+                    format!("the name {:?} is empty or used twice", key.name),
+                ));
             }
             key.hash()?;
         }
@@ -126,7 +134,10 @@ impl ApiKey {
         let wrong = || {
             InvalidValue::new(
                 "auth.keys",
-                format!("sha256 of key {:?} is not 64 hexadecimal digits (printf %s KEY | sha256sum)", self.name),
+                format!(
+                    "sha256 of key {:?} is not 64 hexadecimal digits (printf %s KEY | sha256sum)",
+                    self.name
+                ),
             )
         };
         if self.sha256.len() != 64 || !self.sha256.is_ascii() {

@@ -1,4 +1,5 @@
-//! One realistic answer for every operation of the OpenAPI document, and bodies to send to those that take JSON.
+//! One realistic answer for every operation of the OpenAPI document, and bodies to send to those
+//! that take JSON.
 //!
 //! They follow one story: a camera drives through a harbour, and a frame of it is looked for again.
 
@@ -7,9 +8,11 @@ use serde_json::{Value, json};
 const ID: &str = "0197f3c2-7c1e-7d3a-9b1f-2f6f0c1d2e3f";
 const MODEL: &str = "dinov2-vits14:747267a07f39:b8:448x336:t1:k400-200-50:h0a81be38658c";
 /// A grey PNG of one pixel.
-const PIXEL: &str = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg==";
+const PIXEL: &str =
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg==";
 
-/// What an operation answers when all goes well, as JSON or as the text of another type; `None` without a body.
+/// What an operation answers when all goes well, as JSON or as the text of another type; `None`
+/// without a body.
 pub(super) fn answer(operation_id: &str) -> Option<Value> {
     Some(match operation_id {
         "livez" => json!({"status": "live"}),
@@ -18,7 +21,9 @@ pub(super) fn answer(operation_id: &str) -> Option<Value> {
             "# HELP placeformer_queue_depth Requests waiting for or in compute.\n\
              # TYPE placeformer_queue_depth gauge\nplaceformer_queue_depth 3\n"
         ),
-        "openapi_json" => json!({"openapi": "3.1.0", "info": {"title": "PlaceFormer"}, "paths": {}}),
+        "openapi_json" => {
+            json!({"openapi": "3.1.0", "info": {"title": "PlaceFormer"}, "paths": {}})
+        }
         "info" => info(),
         "list_maps" => json!({"maps": [map()]}),
         "get_map" | "give_map_head" | "remove_map_head" => map(),
@@ -40,9 +45,11 @@ pub(super) fn not_ready() -> Value {
 /// A JSON body for an operation that takes one.
 pub(super) fn body(operation_id: &str) -> Option<Value> {
     Some(match operation_id {
-        "create_reference" => json!({"image": PIXEL, "map": "harbour", "external_id": "drive7/000123.jpg",
+        "create_reference" => {
+            json!({"image": PIXEL, "map": "harbour", "external_id": "drive7/000123.jpg",
             "lat": 51.5072, "lon": -0.1276, "heading": 270, "captured_at": "2026-05-17T09:30:00Z",
-            "metadata": {"camera": "left"}}),
+            "metadata": {"camera": "left"}})
+        }
         "update_reference" => json!({"heading": 90, "metadata": null}),
         "query" => json!({"image": PIXEL, "map": "harbour", "top_k": 5, "deadline_ms": 2000}),
         "match_images" => json!({"query": PIXEL, "reference": PIXEL}),
@@ -149,19 +156,34 @@ mod tests {
     fn check(document: &Value, schema: &Value, value: &Value, place: &str, compared: &mut usize) {
         let schema = resolve(document, schema);
         if let Some(choices) = schema["oneOf"].as_array() {
-            let choice = choices.iter().find(|choice| (choice["type"] == "null") == value.is_null()).unwrap();
+            let choice = choices
+                .iter()
+                .find(|choice| (choice["type"] == "null") == value.is_null())
+                .unwrap();
             return check(document, choice, value, place, compared);
         }
         if let (Some(items), Some(values)) = (schema.get("items"), value.as_array()) {
-            values.iter().for_each(|value| check(document, items, value, place, compared));
+            values
+                .iter()
+                .for_each(|value| check(document, items, value, place, compared));
         }
-        let (Some(properties), Some(fields)) = (schema["properties"].as_object(), value.as_object()) else { return };
+        let (Some(properties), Some(fields)) =
+            (schema["properties"].as_object(), value.as_object())
+        else {
+            return;
+        };
         *compared += 1;
         let known: BTreeSet<&String> = properties.keys().collect();
         let given: BTreeSet<&String> = fields.keys().collect();
         assert_eq!(given, known, "{place}");
         for (name, field) in fields {
-            check(document, &properties[name], field, &format!("{place}.{name}"), compared);
+            check(
+                document,
+                &properties[name],
+                field,
+                &format!("{place}.{name}"),
+                compared,
+            );
         }
     }
 
@@ -175,7 +197,13 @@ mod tests {
                     let content = &response["content"]["application/json"];
                     if content["example"].is_object() {
                         let place = format!("{method} {path} {status}");
-                        check(&document, &content["schema"], &content["example"], &place, &mut compared);
+                        check(
+                            &document,
+                            &content["schema"],
+                            &content["example"],
+                            &place,
+                            &mut compared,
+                        );
                     }
                 }
             }

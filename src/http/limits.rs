@@ -37,8 +37,13 @@ impl RateLimits {
     /// One pace per key; on an open service one per address.
     pub fn new(config: &AuthConfig, metrics: Arc<Metrics>) -> Self {
         let keys = config.keys.iter().filter_map(|key| {
-            let pace = key.requests_per_second.unwrap_or(config.requests_per_second);
-            Some((key.name.clone(), RateLimiter::direct(quota(pace, config.burst)?)))
+            let pace = key
+                .requests_per_second
+                .unwrap_or(config.requests_per_second);
+            Some((
+                key.name.clone(),
+                RateLimiter::direct(quota(pace, config.burst)?),
+            ))
         });
         Self {
             keys: keys.collect(),
@@ -60,7 +65,10 @@ impl RateLimits {
         };
         let Some(wait) = wait else { return Ok(()) };
         self.metrics.rejected(Rejection::RateLimited);
-        let detail = format!("at most {} requests a second", wait.quota().replenish_interval_rate());
+        let detail = format!(
+            "at most {} requests a second",
+            wait.quota().replenish_interval_rate()
+        );
         Err(ApiError::new(ErrorCode::RateLimited, detail)
             .retry_after(wait.wait_time_from(DefaultClock::default().now())))
     }
@@ -110,12 +118,20 @@ const BLOCK: usize = 64 << 10;
 impl BodyMemory {
     /// A budget in bytes.
     pub fn new(bytes: usize, metrics: Arc<Metrics>) -> Self {
-        Self { blocks: Arc::new(Semaphore::new(bytes.div_ceil(BLOCK).min(Semaphore::MAX_PERMITS))), metrics }
+        Self {
+            blocks: Arc::new(Semaphore::new(
+                bytes.div_ceil(BLOCK).min(Semaphore::MAX_PERMITS),
+            )),
+            metrics,
+        }
     }
 
     /// Starts with room for 64 KiB.
     pub fn hold(&self) -> Result<Held, ApiError> {
-        Ok(Held { permit: take(&self.blocks, 1, &self.metrics)?, metrics: self.metrics.clone() })
+        Ok(Held {
+            permit: take(&self.blocks, 1, &self.metrics)?,
+            metrics: self.metrics.clone(),
+        })
     }
 }
 
@@ -124,7 +140,8 @@ impl Held {
     pub fn resize(&mut self, bytes: usize) -> Result<(), ApiError> {
         let (have, want) = (self.permit.num_permits(), bytes.div_ceil(BLOCK).max(1));
         if want > have {
-            self.permit.merge(take(self.permit.semaphore(), want - have, &self.metrics)?);
+            self.permit
+                .merge(take(self.permit.semaphore(), want - have, &self.metrics)?);
         } else {
             drop(self.permit.split(have - want));
         }
@@ -133,21 +150,39 @@ impl Held {
 
     /// A buffer with this room.
     pub fn keep_one(self, bytes: Vec<u8>) -> Bytes {
-        Bytes::from_owner(Charged { bytes, _held: Arc::new(self) })
+        Bytes::from_owner(Charged {
+            bytes,
+            _held: Arc::new(self),
+        })
     }
 
     /// Buffers that share this room until the last of them, and of their clones, is dropped.
     pub fn keep(self, buffers: Vec<Vec<u8>>) -> Vec<Bytes> {
         let held = Arc::new(self);
-        buffers.into_iter().map(|bytes| Bytes::from_owner(Charged { bytes, _held: held.clone() })).collect()
+        buffers
+            .into_iter()
+            .map(|bytes| {
+                Bytes::from_owner(Charged {
+                    bytes,
+                    _held: held.clone(),
+                })
+            })
+            .collect()
     }
 }
 
-fn take(blocks: &Arc<Semaphore>, count: usize, metrics: &Metrics) -> Result<OwnedSemaphorePermit, ApiError> {
+fn take(
+    blocks: &Arc<Semaphore>,
+    count: usize,
+    metrics: &Metrics,
+) -> Result<OwnedSemaphorePermit, ApiError> {
     let count = u32::try_from(count).unwrap_or(u32::MAX);
     blocks.clone().try_acquire_many_owned(count).map_err(|_| {
         metrics.rejected(Rejection::BodyMemory);
-        ApiError::new(ErrorCode::Overloaded, "too many bytes of bodies are being received at once")
+        ApiError::new(
+            ErrorCode::Overloaded,
+            "too many bytes of bodies are being received at once",
+        )
     })
 }
 
@@ -161,10 +196,16 @@ mod tests {
 
     #[test]
     fn a_caller_beyond_its_pace_is_told_when_to_come_back() {
-        let config = AuthConfig { requests_per_second: 2, ..Default::default() };
+        let config = AuthConfig {
+            requests_per_second: 2,
+            ..Default::default()
+        };
         let limits = RateLimits::new(&config, metrics());
         let (one, other) = ("10.0.0.1".parse().unwrap(), "10.0.0.2".parse().unwrap());
-        assert!(limits.check(&Caller::Address(one)).is_ok() && limits.check(&Caller::Address(one)).is_ok());
+        assert!(
+            limits.check(&Caller::Address(one)).is_ok()
+                && limits.check(&Caller::Address(one)).is_ok()
+        );
         let refused = limits.check(&Caller::Address(one)).unwrap_err();
         assert_eq!(refused.code, ErrorCode::RateLimited);
         assert!(refused.retry_after.unwrap() <= std::time::Duration::from_secs(1));

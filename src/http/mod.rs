@@ -1,12 +1,13 @@
 //! The web surface over the pipeline.
 //!
-//! [`app`] turns an [`AppState`] into a router that tests call without a socket; [`serve()`] runs it on a listener
-//! with the limits that only a connection knows. From the outside in, a request passes: its id, span and metrics
-//! ([`observe`]); a net for panics; key and rate ([`auth`], [`limits`]); the body within its bounds ([`body`]); the
-//! handler ([`routes`]). Every failure leaves as problem+json ([`problem`]).
+//! [`app`] turns an [`AppState`] into a router that tests call without a socket; [`serve()`] runs
+//! it on a listener with the limits that only a connection knows. From the outside in, a request
+//! passes: its id, span and metrics ([`observe`]); a net for panics; key and rate ([`auth`],
+//! [`limits`]); the body within its bounds ([`body`]); the handler ([`routes`]). Every failure
+//! leaves as problem+json ([`problem`]).
 //!
-//! The server answers `/livez` and `/readyz` from its first moment; everything that needs the service answers
-//! `not_ready` until start-up puts it into the state.
+//! The server answers `/livez` and `/readyz` from its first moment; everything that needs the
+//! service answers `not_ready` until start-up puts it into the state.
 
 pub mod auth;
 pub mod body;
@@ -62,7 +63,8 @@ pub struct Shared {
     pub metrics: Arc<Metrics>,
     /// Readiness.
     pub health: Arc<Health>,
-    /// Cancelled when the time for draining is over: what is still running is answered with `shutting_down`.
+    /// Cancelled when the time for draining is over: what is still running is answered with
+    /// `shutting_down`.
     pub stopping: CancellationToken,
 }
 
@@ -114,8 +116,14 @@ impl AppState {
     pub fn service(&self) -> Result<&Arc<Service>, ApiError> {
         self.service.get().ok_or_else(|| {
             self.metrics.rejected(Rejection::NotReady);
-            let reason = self.health.unready().map_or("starting", |reason| reason.as_str());
-            ApiError::new(ErrorCode::NotReady, format!("the server is not ready yet: {reason}"))
+            let reason = self
+                .health
+                .unready()
+                .map_or("starting", |reason| reason.as_str());
+            ApiError::new(
+                ErrorCode::NotReady,
+                format!("the server is not ready yet: {reason}"),
+            )
         })
     }
 }
@@ -134,8 +142,14 @@ pub fn app(state: AppState) -> Router {
 }
 
 fn panicked(cause: Box<dyn Any + Send>) -> Response {
-    let text = cause.downcast_ref::<&str>().copied().or_else(|| cause.downcast_ref::<String>().map(String::as_str));
+    let text = cause
+        .downcast_ref::<&str>()
+        .copied()
+        .or_else(|| cause.downcast_ref::<String>().map(String::as_str));
     tracing::error!(panic = text.unwrap_or("unknown"), "a handler panicked");
-    ApiError::new(ErrorCode::Internal, "the server failed; the log names the cause under this request's id")
-        .into_response()
+    ApiError::new(
+        ErrorCode::Internal,
+        "the server failed; the log names the cause under this request's id",
+    )
+    .into_response()
 }

@@ -23,10 +23,21 @@ pub async fn observe(State(state): State<AppState>, request: Request, next: Next
     let method = method_label(request.method());
     let matched = request.extensions().get::<MatchedPath>();
     let route = matched.map_or("unmatched", MatchedPath::as_str).to_owned();
-    let span =
-        tracing::info_span!("request", request_id, method, path = request.uri().path(), key = tracing::field::Empty);
-    let mut guard =
-        Guard { state: state.clone(), route, method, started: Instant::now(), span: span.clone(), done: false };
+    let span = tracing::info_span!(
+        "request",
+        request_id,
+        method,
+        path = request.uri().path(),
+        key = tracing::field::Empty
+    );
+    let mut guard = Guard {
+        state: state.clone(),
+        route,
+        method,
+        started: Instant::now(),
+        span: span.clone(),
+        done: false,
+    };
     let stopping = state.stopping.clone();
     let answered = async {
         tokio::select! {
@@ -50,9 +61,16 @@ pub async fn observe(State(state): State<AppState>, request: Request, next: Next
 /// The client's own id if it is harmless in a log line, else a new one.
 fn accepted_or_minted(request: &Request) -> String {
     let harmless = |text: &&str| {
-        (1..=128).contains(&text.len()) && text.bytes().all(|c| c.is_ascii_alphanumeric() || b"._-".contains(&c))
+        (1..=128).contains(&text.len())
+            && text
+                .bytes()
+                .all(|c| c.is_ascii_alphanumeric() || b"._-".contains(&c))
     };
-    let given = request.headers().get(REQUEST_ID).and_then(|value| value.to_str().ok()).filter(harmless);
+    let given = request
+        .headers()
+        .get(REQUEST_ID)
+        .and_then(|value| value.to_str().ok())
+        .filter(harmless);
     given.map_or_else(|| Uuid::now_v7().to_string(), str::to_owned)
 }
 
@@ -87,7 +105,9 @@ impl Guard {
 
     fn note(&self, status: u16) {
         let took = self.started.elapsed();
-        self.state.metrics.request(&self.route, self.method, status, took);
+        self.state
+            .metrics
+            .request(&self.route, self.method, status, took);
         let ms = took.as_secs_f64() * 1e3;
         self.span.in_scope(|| match self.route.as_str() {
             "/livez" | "/readyz" | "/metrics" => tracing::debug!(status, ms, "answered"),

@@ -66,10 +66,17 @@ fn schema_value<T: PartialSchema>() -> Value {
 
 /// Every operation with its path and method.
 fn operations(document: &mut Value) -> Vec<(String, String, &mut Value)> {
-    let Some(paths) = document["paths"].as_object_mut() else { return Vec::new() };
-    let items = paths.iter_mut().filter_map(|(path, item)| Some((path, item.as_object_mut()?)));
+    let Some(paths) = document["paths"].as_object_mut() else {
+        return Vec::new();
+    };
+    let items = paths
+        .iter_mut()
+        .filter_map(|(path, item)| Some((path, item.as_object_mut()?)));
     items
-        .flat_map(|(path, item)| item.iter_mut().map(|(method, value)| (path.clone(), method.clone(), value)))
+        .flat_map(|(path, item)| {
+            item.iter_mut()
+                .map(|(method, value)| (path.clone(), method.clone(), value))
+        })
         .filter(|(_, method, _)| method != "parameters")
         .collect()
 }
@@ -82,7 +89,10 @@ fn is_public(path: &str) -> bool {
 pub fn expect_routes(metrics: &Metrics) {
     let mut document = document();
     for (path, method, operation) in operations(&mut document) {
-        let statuses = operation["responses"].as_object().into_iter().flat_map(Map::keys);
+        let statuses = operation["responses"]
+            .as_object()
+            .into_iter()
+            .flat_map(Map::keys);
         let statuses: Vec<u16> = statuses.filter_map(|status| status.parse().ok()).collect();
         metrics.expect_route(&path, &method.to_uppercase(), statuses);
     }
@@ -91,35 +101,101 @@ pub fn expect_routes(metrics: &Metrics) {
 /// What each operation can fail with.
 fn errors_of(path: &str, method: &str) -> Vec<ErrorCode> {
     use ErrorCode::*;
-    let guarded = [Unauthorized, Forbidden, RateLimited, NotReady, Overloaded, ShuttingDown, Internal];
-    let sent = [MalformedRequest, InvalidParameter, RequestTimeout, BodyTooLarge, UnsupportedMediaType];
+    let guarded = [
+        Unauthorized,
+        Forbidden,
+        RateLimited,
+        NotReady,
+        Overloaded,
+        ShuttingDown,
+        Internal,
+    ];
+    let sent = [
+        MalformedRequest,
+        InvalidParameter,
+        RequestTimeout,
+        BodyTooLarge,
+        UnsupportedMediaType,
+    ];
     let image = [EmptyImage, ImageTooLarge, ImageUndecodable];
     let own: &[&[ErrorCode]] = match (path, method) {
         ("/livez", _) | ("/openapi.json", _) => return vec![Internal],
         ("/readyz", _) => return vec![InvalidParameter],
         ("/metrics", _) => return vec![Unauthorized, Forbidden, RateLimited, Internal],
-        ("/references", "post") => {
-            &[&sent, &image, &[ExternalIdConflict, ModelMismatch, CorruptRecord, MemoryPressure, DiskFull]]
-        }
-        ("/query", _) => &[&sent, &image, &[MapNotFound, ModelMismatch, CorruptRecord, DeadlineExceeded]],
-        ("/match", _) => &[&sent, &image, &[ReferenceNotFound, ModelMismatch, CorruptRecord, DeadlineExceeded]],
+        ("/references", "post") => &[
+            &sent,
+            &image,
+            &[
+                ExternalIdConflict,
+                ModelMismatch,
+                CorruptRecord,
+                MemoryPressure,
+                DiskFull,
+            ],
+        ],
+        ("/query", _) => &[
+            &sent,
+            &image,
+            &[MapNotFound, ModelMismatch, CorruptRecord, DeadlineExceeded],
+        ],
+        ("/match", _) => &[
+            &sent,
+            &image,
+            &[
+                ReferenceNotFound,
+                ModelMismatch,
+                CorruptRecord,
+                DeadlineExceeded,
+            ],
+        ],
         ("/references", _) => &[&[InvalidParameter, MapNotFound, CorruptRecord]],
-        ("/references/{id}", "patch") => &[&sent, &[ReferenceNotFound, ExternalIdConflict, CorruptRecord, DiskFull]],
+        ("/references/{id}", "patch") => &[
+            &sent,
+            &[
+                ReferenceNotFound,
+                ExternalIdConflict,
+                CorruptRecord,
+                DiskFull,
+            ],
+        ],
         ("/references/{id}", "delete") => &[&[ReferenceNotFound, CorruptRecord, DiskFull]],
         ("/references/{id}", _) => &[&[ReferenceNotFound, CorruptRecord]],
-        ("/maps/{map}/calibration", "put") => &[&sent, &[MapNotFound, CalibrationMismatch, CorruptRecord, DiskFull]],
-        ("/maps/{map}/calibration", _) | ("/maps/{map}", "delete") => &[&[MapNotFound, CorruptRecord, DiskFull]],
+        ("/maps/{map}/calibration", "put") => &[
+            &sent,
+            &[MapNotFound, CalibrationMismatch, CorruptRecord, DiskFull],
+        ],
+        ("/maps/{map}/calibration", _) | ("/maps/{map}", "delete") => {
+            &[&[MapNotFound, CorruptRecord, DiskFull]]
+        }
         ("/maps/{map}/head", "put") => &[
             &sent,
-            &[MapNotFound, HeadUnreadable, HeadMismatch, ModelMismatch, CorruptRecord, MemoryPressure, DiskFull],
+            &[
+                MapNotFound,
+                HeadUnreadable,
+                HeadMismatch,
+                ModelMismatch,
+                CorruptRecord,
+                MemoryPressure,
+                DiskFull,
+            ],
         ],
-        ("/maps/{map}/head", _) => {
-            &[&[MapNotFound, HeadMismatch, ModelMismatch, CorruptRecord, MemoryPressure, DiskFull]]
-        }
+        ("/maps/{map}/head", _) => &[&[
+            MapNotFound,
+            HeadMismatch,
+            ModelMismatch,
+            CorruptRecord,
+            MemoryPressure,
+            DiskFull,
+        ]],
         ("/maps/{map}", _) => &[&[MapNotFound, CorruptRecord]],
         _ => &[],
     };
-    let mut codes: Vec<ErrorCode> = own.iter().flat_map(|codes| codes.iter()).chain(&guarded).copied().collect();
+    let mut codes: Vec<ErrorCode> = own
+        .iter()
+        .flat_map(|codes| codes.iter())
+        .chain(&guarded)
+        .copied()
+        .collect();
     codes.sort_by_key(|code| code.status());
     codes
 }
@@ -130,9 +206,14 @@ fn add_errors(operation: &mut Value, codes: &[ErrorCode]) {
         by_status.entry(code.status()).or_default().push(code);
     }
     for (status, codes) in by_status {
-        let examples: Map<String, Value> =
-            codes.iter().map(|code| (code.as_str().to_owned(), json!({"value": example(*code)}))).collect();
-        let lines: Vec<String> = codes.iter().map(|code| format!("`{}`: {}.", code.as_str(), code.title())).collect();
+        let examples: Map<String, Value> = codes
+            .iter()
+            .map(|code| (code.as_str().to_owned(), json!({"value": example(*code)})))
+            .collect();
+        let lines: Vec<String> = codes
+            .iter()
+            .map(|code| format!("`{}`: {}.", code.as_str(), code.title()))
+            .collect();
         let response = &mut operation["responses"][status.to_string()];
         if response.is_null() {
             *response = json!({});
@@ -140,7 +221,10 @@ fn add_errors(operation: &mut Value, codes: &[ErrorCode]) {
         response["description"] = Value::from(lines.join(" "));
         response["content"][PROBLEM_JSON] =
             json!({"schema": {"$ref": "#/components/schemas/ProblemBody"}, "examples": examples});
-        if codes.iter().any(|code| matches!(code.status(), 429 | 503 | 507)) {
+        if codes
+            .iter()
+            .any(|code| matches!(code.status(), 429 | 503 | 507))
+        {
             response["headers"]["retry-after"] = json!({"description": "Seconds after which to try again.", "schema": {"type": "integer", "minimum": 1}});
         }
     }
@@ -160,18 +244,26 @@ fn example(code: ErrorCode) -> Value {
 
 /// A realistic answer, and a JSON body to send.
 fn add_examples(operation: &mut Value) {
-    let id = operation["operationId"].as_str().unwrap_or_default().to_owned();
+    let id = operation["operationId"]
+        .as_str()
+        .unwrap_or_default()
+        .to_owned();
     for (status, response) in operation["responses"].as_object_mut().into_iter().flatten() {
-        let example = if status == "503" { Some(examples::not_ready()) } else { examples::answer(&id) };
+        let example = if status == "503" {
+            Some(examples::not_ready())
+        } else {
+            examples::answer(&id)
+        };
         // Indexing would add the key to answers without a body.
         let contents = response.get_mut("content").and_then(Value::as_object_mut);
         for (_, content) in contents.into_iter().flatten() {
             content["example"] = example.clone().unwrap_or_default();
         }
     }
-    if let (Some(content), Some(body)) =
-        (operation.pointer_mut("/requestBody/content/application~1json"), examples::body(&id))
-    {
+    if let (Some(content), Some(body)) = (
+        operation.pointer_mut("/requestBody/content/application~1json"),
+        examples::body(&id),
+    ) {
         content["example"] = body;
     }
 }
@@ -179,9 +271,24 @@ fn add_examples(operation: &mut Value) {
 /// The three ways to send images.
 fn describe_uploads(document: &mut Value) {
     let uploads = [
-        ("/references", schema_value::<routes::references::ReferenceParams>(), &["image"][..], &["image", "map"][..]),
-        ("/query", schema_value::<routes::query::QueryParams>(), &["image"], &["image", "map"]),
-        ("/match", schema_value::<routes::match_images::MatchParams>(), &["query", "reference"], &["query"]),
+        (
+            "/references",
+            schema_value::<routes::references::ReferenceParams>(),
+            &["image"][..],
+            &["image", "map"][..],
+        ),
+        (
+            "/query",
+            schema_value::<routes::query::QueryParams>(),
+            &["image"],
+            &["image", "map"],
+        ),
+        (
+            "/match",
+            schema_value::<routes::match_images::MatchParams>(),
+            &["query", "reference"],
+            &["query"],
+        ),
     ];
     for (path, params, images, required) in uploads {
         let raw = binary();
@@ -191,8 +298,7 @@ fn describe_uploads(document: &mut Value) {
         let mut plain = params.clone();
         plain["required"] = json!(required);
         for image in images {
-            form["properties"][image] =
-                json!({"type": "string", "format": "binary", "description": "A JPEG, PNG or WebP image."});
+            form["properties"][image] = json!({"type": "string", "format": "binary", "description": "A JPEG, PNG or WebP image."});
             plain["properties"][image] = json!({"type": "string", "contentEncoding": "base64",
                 "description": "A JPEG, PNG or WebP image in base64."});
         }

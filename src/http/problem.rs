@@ -1,8 +1,9 @@
 //! Every failure as RFC 9457 `application/problem+json`, from the one error table.
 //!
-//! Handlers return [`ApiError`]; its response carries the error itself as an extension and no body. The outermost
-//! layer writes the body, because only it knows the request's id; it also turns whatever else answers with an error
-//! status (the router's 404 and 405, a panic) into the same shape.
+//! Handlers return [`ApiError`]; its response carries the error itself as an extension and no body.
+//! The outermost layer writes the body, because only it knows the request's id; it also turns
+//! whatever else answers with an error status (the router's 404 and 405, a panic) into the same
+//! shape.
 
 use crate::error::ErrorCode;
 use crate::pipeline::PipelineError;
@@ -57,7 +58,11 @@ pub struct ProblemBody {
 impl ApiError {
     /// An error with its cause in words.
     pub fn new(code: ErrorCode, detail: impl Into<String>) -> Self {
-        Self { code, detail: detail.into(), retry_after: None }
+        Self {
+            code,
+            detail: detail.into(),
+            retry_after: None,
+        }
     }
 
     /// A parameter is missing, unknown, of the wrong type or out of range.
@@ -92,8 +97,14 @@ impl ApiError {
     /// Answers that ask the client to come back say when: as known, else after a second.
     fn retry_after_seconds(&self) -> Option<u64> {
         let asks = matches!(self.code.status(), 429 | 503 | 504 | 507);
-        let known = self.retry_after.map(|after| after.as_secs_f64().ceil().max(1.0) as u64);
-        known.or(asks.then_some(if self.code == ErrorCode::DiskFull { 30 } else { 1 }))
+        let known = self
+            .retry_after
+            .map(|after| after.as_secs_f64().ceil().max(1.0) as u64);
+        known.or(asks.then_some(if self.code == ErrorCode::DiskFull {
+            30
+        } else {
+            1
+        }))
     }
 }
 
@@ -105,10 +116,16 @@ impl From<PipelineError> for ApiError {
         }
         // What broke inside is for the log; a client can do nothing with it.
         let detail = match code {
-            ErrorCode::Internal => "the server failed; the log names the cause under this request's id".to_owned(),
+            ErrorCode::Internal => {
+                "the server failed; the log names the cause under this request's id".to_owned()
+            }
             _ => error_chain(&error),
         };
-        Self { code, detail, retry_after: error.retry_after() }
+        Self {
+            code,
+            detail,
+            retry_after: error.retry_after(),
+        }
     }
 }
 
@@ -163,20 +180,34 @@ pub fn finish(response: Response, request_id: &str) -> Response {
         return response;
     }
     let (mut parts, _) = response.into_parts();
-    let error = parts.extensions.remove::<ApiError>().unwrap_or_else(|| of_status(status));
+    let error = parts
+        .extensions
+        .remove::<ApiError>()
+        .unwrap_or_else(|| of_status(status));
     parts.status = status_of(error.code);
     if let Some(seconds) = error.retry_after_seconds() {
-        parts.headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+        parts
+            .headers
+            .insert(header::RETRY_AFTER, HeaderValue::from(seconds));
     }
     if error.code == ErrorCode::Unauthorized {
-        parts.headers.insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
+        parts
+            .headers
+            .insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
     }
-    if matches!(error.code, ErrorCode::RequestTimeout | ErrorCode::BodyTooLarge) {
+    if matches!(
+        error.code,
+        ErrorCode::RequestTimeout | ErrorCode::BodyTooLarge
+    ) {
         // The rest of the body is not read, so the connection cannot be used again.
-        parts.headers.insert(header::CONNECTION, HeaderValue::from_static("close"));
+        parts
+            .headers
+            .insert(header::CONNECTION, HeaderValue::from_static("close"));
     }
     parts.headers.remove(header::CONTENT_LENGTH);
-    parts.headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(PROBLEM_JSON));
+    parts
+        .headers
+        .insert(header::CONTENT_TYPE, HeaderValue::from_static(PROBLEM_JSON));
     // A struct of strings and numbers always serialises.
     let body = serde_json::to_vec(&error.body(request_id)).unwrap_or_default();
     Response::from_parts(parts, Body::from(body))
@@ -185,16 +216,28 @@ pub fn finish(response: Response, request_id: &str) -> Response {
 /// An error that the framework answered by itself.
 fn of_status(status: StatusCode) -> ApiError {
     match status {
-        StatusCode::NOT_FOUND => ApiError::new(ErrorCode::RouteNotFound, "see /docs for the paths there are"),
-        StatusCode::METHOD_NOT_ALLOWED => {
-            ApiError::new(ErrorCode::MethodNotAllowed, "the Allow header names the methods this path supports")
+        StatusCode::NOT_FOUND => ApiError::new(
+            ErrorCode::RouteNotFound,
+            "see /docs for the paths there are",
+        ),
+        StatusCode::METHOD_NOT_ALLOWED => ApiError::new(
+            ErrorCode::MethodNotAllowed,
+            "the Allow header names the methods this path supports",
+        ),
+        StatusCode::PAYLOAD_TOO_LARGE => {
+            ApiError::new(ErrorCode::BodyTooLarge, "the body is larger than allowed")
         }
-        StatusCode::PAYLOAD_TOO_LARGE => ApiError::new(ErrorCode::BodyTooLarge, "the body is larger than allowed"),
-        StatusCode::UNSUPPORTED_MEDIA_TYPE => {
-            ApiError::new(ErrorCode::UnsupportedMediaType, "the body's media type is not supported here")
+        StatusCode::UNSUPPORTED_MEDIA_TYPE => ApiError::new(
+            ErrorCode::UnsupportedMediaType,
+            "the body's media type is not supported here",
+        ),
+        StatusCode::REQUEST_TIMEOUT => ApiError::new(
+            ErrorCode::RequestTimeout,
+            "the request took too long to arrive",
+        ),
+        status if status.is_client_error() => {
+            ApiError::malformed("the request cannot be understood")
         }
-        StatusCode::REQUEST_TIMEOUT => ApiError::new(ErrorCode::RequestTimeout, "the request took too long to arrive"),
-        status if status.is_client_error() => ApiError::malformed("the request cannot be understood"),
         _ => ApiError::new(ErrorCode::Internal, "the server failed"),
     }
 }

@@ -25,8 +25,9 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// Time for the last answers to leave once draining is over.
 const LAST_WORDS: Duration = Duration::from_secs(2);
 
-/// Serves until `shutdown` resolves, then drains: readiness fails at once, connections are refused after the drain
-/// delay, and what is still running at the end of the drain time is answered with `shutting_down`.
+/// Serves until `shutdown` resolves, then drains: readiness fails at once, connections are refused
+/// after the drain delay, and what is still running at the end of the drain time is answered with
+/// `shutting_down`.
 pub async fn serve(listener: TcpListener, state: AppState, shutdown: impl Future<Output = ()>) {
     let router = app(state.clone());
     let graceful = GracefulShutdown::new();
@@ -71,7 +72,11 @@ async fn accept(
     listener: &TcpListener,
     places: &Arc<Semaphore>,
 ) -> io::Result<(TcpStream, SocketAddr, OwnedSemaphorePermit)> {
-    let place = places.clone().acquire_owned().await.map_err(io::Error::other)?;
+    let place = places
+        .clone()
+        .acquire_owned()
+        .await
+        .map_err(io::Error::other)?;
     let (stream, peer) = listener.accept().await?;
     stream.set_nodelay(true)?;
     Ok((stream, peer, place))
@@ -80,21 +85,35 @@ async fn accept(
 type Connection = http1::Connection<
     TokioIo<TcpStream>,
     TowerToHyperService<
-        tower::util::BoxCloneService<Request<Incoming>, axum::response::Response, std::convert::Infallible>,
+        tower::util::BoxCloneService<
+            Request<Incoming>,
+            axum::response::Response,
+            std::convert::Infallible,
+        >,
     >,
 >;
 
-fn connect(stream: TcpStream, peer: SocketAddr, router: &axum::Router, state: &AppState) -> Connection {
-    let service = router.clone().map_request(move |request: Request<Incoming>| {
-        let mut request = request.map(Body::new);
-        request.extensions_mut().insert(Peer(peer));
-        request
-    });
+fn connect(
+    stream: TcpStream,
+    peer: SocketAddr,
+    router: &axum::Router,
+    state: &AppState,
+) -> Connection {
+    let service = router
+        .clone()
+        .map_request(move |request: Request<Incoming>| {
+            let mut request = request.map(Body::new);
+            request.extensions_mut().insert(Peer(peer));
+            request
+        });
     http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(Duration::from_millis(state.http.header_timeout_ms))
         .max_header_size(state.http.max_header_bytes)
-        .serve_connection(TokioIo::new(stream), TowerToHyperService::new(tower::util::BoxCloneService::new(service)))
+        .serve_connection(
+            TokioIo::new(stream),
+            TowerToHyperService::new(tower::util::BoxCloneService::new(service)),
+        )
 }
 
 async fn drain(graceful: GracefulShutdown, state: &AppState) {
@@ -104,7 +123,9 @@ async fn drain(graceful: GracefulShutdown, state: &AppState) {
     if timeout(allowed, &mut finished).await.is_ok() {
         return;
     }
-    tracing::warn!("the time for draining is over; what is still running is answered with shutting_down");
+    tracing::warn!(
+        "the time for draining is over; what is still running is answered with shutting_down"
+    );
     state.stopping.cancel();
     if timeout(LAST_WORDS, &mut finished).await.is_err() {
         tracing::warn!("some connections would not end");

@@ -21,18 +21,34 @@ pub fn encode_png(image: &RgbImage) -> Result<Vec<u8>, ImageError> {
 /// An image without pixels, over 65,535 pixels wide or high, or whose pixels do not fill its size.
 pub fn encode_jpeg(image: &RgbImage, quality: u8) -> Result<Vec<u8>, ImageError> {
     let mut bytes = Vec::new();
-    write(image, "JPEG", JpegEncoder::new_with_quality(&mut bytes, quality.clamp(1, 100)))?;
+    write(
+        image,
+        "JPEG",
+        JpegEncoder::new_with_quality(&mut bytes, quality.clamp(1, 100)),
+    )?;
     Ok(bytes)
 }
 
-fn write(image: &RgbImage, format: &'static str, encoder: impl ImageEncoder) -> Result<(), ImageError> {
+fn write(
+    image: &RgbImage,
+    format: &'static str,
+    encoder: impl ImageEncoder,
+) -> Result<(), ImageError> {
     let fail = |reason: String| ImageError::Unencodable { format, reason };
     let (width, height) = (image.size.width, image.size.height);
     // The encoders assert this; a typed error is kinder than their panic.
-    if image.pixels.is_empty() || image.pixels.len() as u64 != u64::from(width) * u64::from(height) * 3 {
-        return Err(fail(format!("{} bytes do not fill {} RGB pixels", image.pixels.len(), image.size)));
+    if image.pixels.is_empty()
+        || image.pixels.len() as u64 != u64::from(width) * u64::from(height) * 3
+    {
+        return Err(fail(format!(
+            "{} bytes do not fill {} RGB pixels",
+            image.pixels.len(),
+            image.size
+        )));
     }
-    encoder.write_image(&image.pixels, width, height, Rgb8).map_err(|error| fail(error.to_string()))
+    encoder
+        .write_image(&image.pixels, width, height, Rgb8)
+        .map_err(|error| fail(error.to_string()))
 }
 
 #[cfg(test)]
@@ -43,18 +59,44 @@ mod tests {
 
     #[test]
     fn png_returns_exactly_and_jpeg_nearly() {
-        let size = ImageSize { width: 33, height: 17 };
-        let pixels: Vec<u8> = (0..33 * 17).flat_map(|i| [(i % 33 * 7) as u8, (i / 33 * 15) as u8, 90]).collect();
+        let size = ImageSize {
+            width: 33,
+            height: 17,
+        };
+        let pixels: Vec<u8> = (0..33 * 17)
+            .flat_map(|i| [(i % 33 * 7) as u8, (i / 33 * 15) as u8, 90])
+            .collect();
         let image = RgbImage { size, pixels };
-        assert_eq!(decode(&encode_png(&image).unwrap(), &ImageConfig::default()).unwrap(), image);
+        assert_eq!(
+            decode(&encode_png(&image).unwrap(), &ImageConfig::default()).unwrap(),
+            image
+        );
         let lossy = decode(&encode_jpeg(&image, 95).unwrap(), &ImageConfig::default()).unwrap();
-        assert!(lossy.pixels.iter().zip(&image.pixels).all(|(a, b)| a.abs_diff(*b) < 24));
+        assert!(
+            lossy
+                .pixels
+                .iter()
+                .zip(&image.pixels)
+                .all(|(a, b)| a.abs_diff(*b) < 24)
+        );
     }
 
     #[test]
     fn pixels_that_do_not_fill_the_size_are_refused() {
-        let image = RgbImage { size: ImageSize { width: 4, height: 4 }, pixels: vec![0; 7] };
-        assert!(matches!(encode_png(&image), Err(ImageError::Unencodable { .. })));
-        assert!(matches!(encode_jpeg(&image, 80), Err(ImageError::Unencodable { .. })));
+        let image = RgbImage {
+            size: ImageSize {
+                width: 4,
+                height: 4,
+            },
+            pixels: vec![0; 7],
+        };
+        assert!(matches!(
+            encode_png(&image),
+            Err(ImageError::Unencodable { .. })
+        ));
+        assert!(matches!(
+            encode_jpeg(&image, 80),
+            Err(ImageError::Unencodable { .. })
+        ));
     }
 }

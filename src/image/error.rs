@@ -33,7 +33,8 @@ pub enum ImageError {
         /// The limit.
         limit: u64,
     },
-    /// Few enough pixels, but so deep that decoding them would take more memory than the pixel limit allows for.
+    /// Few enough pixels, but so deep that decoding them would take more memory than the pixel
+    /// limit allows for.
     #[error("decoding the image takes {bytes} bytes; at most {limit} are allowed")]
     TooDeep {
         /// Bytes of the decoded samples.
@@ -77,7 +78,9 @@ impl ImageError {
         match self {
             Self::Empty => ErrorCode::EmptyImage,
             Self::TooManyBytes { .. } => ErrorCode::BodyTooLarge,
-            Self::SideTooLong { .. } | Self::TooManyPixels { .. } | Self::TooDeep { .. } => ErrorCode::ImageTooLarge,
+            Self::SideTooLong { .. } | Self::TooManyPixels { .. } | Self::TooDeep { .. } => {
+                ErrorCode::ImageTooLarge
+            }
             Self::UnknownFormat { .. } => ErrorCode::UnsupportedMediaType,
             Self::Undecodable { .. } | Self::DecoderPanicked(_) => ErrorCode::ImageUndecodable,
             Self::EmptyTarget(_) | Self::Unencodable { .. } => ErrorCode::Internal,

@@ -1,7 +1,8 @@
-//! What a camera wrote beside the pixels: which way is up, and where, whither and when the photo was taken.
+//! What a camera wrote beside the pixels: which way is up, and where, whither and when the photo
+//! was taken.
 //!
-//! EXIF is often missing and often broken, so nothing here fails: a tag that is absent, malformed or out of range is
-//! simply not there.
+//! EXIF is often missing and often broken, so nothing here fails: a tag that is absent, malformed
+//! or out of range is simply not there.
 
 use crate::types::{GeoPoint, Heading};
 use ::exif::{Exif, In, Rational, Reader, Tag, Value};
@@ -17,21 +18,31 @@ pub struct ExifInfo {
     pub location: Option<GeoPoint>,
     /// Direction the camera faced. A bearing from magnetic north is passed on uncorrected.
     pub heading: Option<Heading>,
-    /// DateTimeOriginal with its UTC offset; without an offset, the GPS clock (which is UTC); without that,
-    /// DateTimeOriginal taken as UTC.
+    /// DateTimeOriginal with its UTC offset; without an offset, the GPS clock (which is UTC);
+    /// without that, DateTimeOriginal taken as UTC.
     pub captured_at: Option<OffsetDateTime>,
 }
 
 /// Reads position, direction and time from a JPEG, PNG or WebP.
 pub fn read_exif(bytes: &[u8]) -> ExifInfo {
-    let Some(exif) = parse(bytes) else { return ExifInfo::default() };
-    ExifInfo { location: location(&exif), heading: heading(&exif), captured_at: captured_at(&exif) }
+    let Some(exif) = parse(bytes) else {
+        return ExifInfo::default();
+    };
+    ExifInfo {
+        location: location(&exif),
+        heading: heading(&exif),
+        captured_at: captured_at(&exif),
+    }
 }
 
 /// How the stored pixels must be turned.
 pub(super) fn orientation(bytes: &[u8]) -> Orientation {
     parse(bytes)
-        .and_then(|exif| exif.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0))
+        .and_then(|exif| {
+            exif.get_field(Tag::Orientation, In::PRIMARY)?
+                .value
+                .get_uint(0)
+        })
         .and_then(|value| Orientation::from_exif(u8::try_from(value).ok()?))
         .unwrap_or(Orientation::NoTransforms)
 }
@@ -41,7 +52,10 @@ fn parse(bytes: &[u8]) -> Option<Exif> {
     let read = || {
         let mut reader = Reader::new();
         reader.continue_on_error(true);
-        reader.read_from_container(&mut Cursor::new(bytes)).or_else(|error| error.distill_partial_result(|_| {})).ok()
+        reader
+            .read_from_container(&mut Cursor::new(bytes))
+            .or_else(|error| error.distill_partial_result(|_| {}))
+            .ok()
     };
     // A photo whose EXIF defeats the parser is still a photo.
     catch_unwind(AssertUnwindSafe(read)).ok().flatten()
@@ -59,9 +73,14 @@ fn location(exif: &Exif) -> Option<GeoPoint> {
 /// Degrees, minutes and seconds as signed degrees.
 fn angle(exif: &Exif, value: Tag, reference: Tag, negative: char) -> Option<f64> {
     let parts = rationals(exif, value)?;
-    let [degrees, minutes, seconds] = std::array::from_fn(|i| parts.get(i).map_or(Some(0.0), finite));
+    let [degrees, minutes, seconds] =
+        std::array::from_fn(|i| parts.get(i).map_or(Some(0.0), finite));
     let magnitude = degrees? + minutes? / 60.0 + seconds? / 3600.0;
-    let sign = if ascii(exif, reference)?.starts_with(negative) { -1.0 } else { 1.0 };
+    let sign = if ascii(exif, reference)?.starts_with(negative) {
+        -1.0
+    } else {
+        1.0
+    };
     Some(sign * magnitude)
 }
 
@@ -82,7 +101,10 @@ fn captured_at(exif: &Exif) -> Option<OffsetDateTime> {
 fn local_time(text: &str) -> Option<PrimitiveDateTime> {
     let (day, clock) = text.trim().split_once(' ')?;
     let [hour, minute, second] = numbers(clock)?.map(|number| u8::try_from(number).ok());
-    Some(PrimitiveDateTime::new(date(day)?, Time::from_hms(hour?, minute?, second?).ok()?))
+    Some(PrimitiveDateTime::new(
+        date(day)?,
+        Time::from_hms(hour?, minute?, second?).ok()?,
+    ))
 }
 
 /// `YYYY:MM:DD`.
@@ -110,7 +132,12 @@ fn utc_offset(text: &str) -> Option<UtcOffset> {
         _ => return None,
     };
     let (hours, minutes) = clock.split_once(':')?;
-    UtcOffset::from_hms(sign * hours.parse::<i8>().ok()?, sign * minutes.parse::<i8>().ok()?, 0).ok()
+    UtcOffset::from_hms(
+        sign * hours.parse::<i8>().ok()?,
+        sign * minutes.parse::<i8>().ok()?,
+        0,
+    )
+    .ok()
 }
 
 fn gps_time(exif: &Exif) -> Option<OffsetDateTime> {

@@ -1,12 +1,14 @@
 //! Bytes to a normalised tensor: limits, decode, orient, resize, normalise.
 //!
-//! What arrives is whatever a camera, a phone or an attacker sent. So: the format is read from the magic bytes and
-//! never from a name; the size is read from the header and checked before anything is decoded or allocated; what the
-//! decoders report is turned into one error that names the cause; and a decoder that panics costs one request.
+//! What arrives is whatever a camera, a phone or an attacker sent. So: the format is read from the
+//! magic bytes and never from a name; the size is read from the header and checked before anything
+//! is decoded or allocated; what the decoders report is turned into one error that names the cause;
+//! and a decoder that panics costs one request.
 //!
-//! The pixels follow torchvision on a Pillow image, because the model was trained on those: 16-bit samples keep their
-//! high byte, alpha is dropped (not blended), and the resize is Pillow's antialiased bilinear filter. The one
-//! departure is EXIF orientation, which is honoured, on the small image, after resizing.
+//! The pixels follow torchvision on a Pillow image, because the model was trained on those: 16-bit
+//! samples keep their high byte, alpha is dropped (not blended), and the resize is Pillow's
+//! antialiased bilinear filter. The one departure is EXIF orientation, which is honoured, on the
+//! small image, after resizing.
 
 mod decode;
 mod encode;
@@ -37,7 +39,11 @@ pub struct ImageConfig {
 
 impl Default for ImageConfig {
     fn default() -> Self {
-        Self { max_bytes: 20 << 20, max_side: 16_384, max_pixels: 64_000_000 }
+        Self {
+            max_bytes: 20 << 20,
+            max_side: 16_384,
+            max_pixels: 64_000_000,
+        }
     }
 }
 
@@ -68,7 +74,10 @@ pub struct RgbImage {
 impl RgbImage {
     /// An image of one colour.
     pub fn filled(size: ImageSize, colour: [u8; 3]) -> Self {
-        Self { size, pixels: colour.repeat(size.width as usize * size.height as usize) }
+        Self {
+            size,
+            pixels: colour.repeat(size.width as usize * size.height as usize),
+        }
     }
 
     /// The colour at column `x`, row `y`.
@@ -77,7 +86,11 @@ impl RgbImage {
     /// Outside the image.
     pub fn pixel(&self, x: u32, y: u32) -> [u8; 3] {
         let start = (y as usize * self.size.width as usize + x as usize) * 3;
-        [self.pixels[start], self.pixels[start + 1], self.pixels[start + 2]]
+        [
+            self.pixels[start],
+            self.pixels[start + 1],
+            self.pixels[start + 2],
+        ]
     }
 
     /// The same image squashed to `size` with an antialiased bilinear filter.
@@ -104,10 +117,15 @@ pub fn decode(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError
 ///
 /// # Errors
 /// See [`ImageError`]; also when `size` has a side of zero pixels.
-pub fn load_tensor(bytes: &[u8], config: &ImageConfig, size: ImageSize) -> Result<ImageTensor, ImageError> {
+pub fn load_tensor(
+    bytes: &[u8],
+    config: &ImageConfig,
+    size: ImageSize,
+) -> Result<ImageTensor, ImageError> {
     decode::contained(|| {
         let orientation = exif::orientation(bytes);
-        let stored = decode::decode_as_stored(bytes, config, Some(decode::stored_size(orientation, size)))?;
+        let stored =
+            decode::decode_as_stored(bytes, config, Some(decode::stored_size(orientation, size)))?;
         let small = resize::resize(&stored, decode::stored_size(orientation, size))?;
         Ok(resize::normalise(&decode::apply(orientation, small)))
     })

@@ -6,7 +6,8 @@ use std::ops::{Deref, DerefMut};
 #[repr(C, align(64))]
 struct CacheLine([u8; 64]);
 
-/// Elements from a 64-byte boundary on, zeroed when made. The length is fixed by [`resize`](Self::resize).
+/// Elements from a 64-byte boundary on, zeroed when made. The length is fixed by
+/// [`resize`](Self::resize).
 #[derive(Debug, Clone)]
 pub struct AlignedBuffer<T> {
     lines: Vec<CacheLine>,
@@ -16,7 +17,11 @@ pub struct AlignedBuffer<T> {
 
 impl<T> Default for AlignedBuffer<T> {
     fn default() -> Self {
-        Self { lines: Vec::new(), len: 0, element: std::marker::PhantomData }
+        Self {
+            lines: Vec::new(),
+            len: 0,
+            element: std::marker::PhantomData,
+        }
     }
 }
 
@@ -28,8 +33,8 @@ impl<T: bytemuck::Pod> AlignedBuffer<T> {
         buffer
     }
 
-    /// Changes the length, keeping what fits; elements gained are zero or what a longer life left there. Allocates only
-    /// when it has never been this long.
+    /// Changes the length, keeping what fits; elements gained are zero or what a longer life left
+    /// there. Allocates only when it has never been this long.
     pub fn resize(&mut self, len: usize) {
         let lines = (len * size_of::<T>()).div_ceil(size_of::<CacheLine>());
         if lines > self.lines.len() {
@@ -62,6 +67,14 @@ mod tests {
         assert_eq!((buffer.len(), buffer.as_ptr() as usize % 64), (17, 0));
         buffer[16] = 3.0;
         buffer.resize(100);
-        assert_eq!((buffer.len(), buffer[16], buffer[99], buffer.as_ptr() as usize % 64), (100, 3.0, 0.0, 0));
+        assert_eq!(
+            (
+                buffer.len(),
+                buffer[16],
+                buffer[99],
+                buffer.as_ptr() as usize % 64
+            ),
+            (100, 3.0, 0.0, 0)
+        );
     }
 }

@@ -1,8 +1,8 @@
-//! Sums of products over 32-bit words: one f32, two bf16 or four int8 to a word, so that one register tile serves every
-//! [`Format`](super::operand::Format).
+//! Sums of products over 32-bit words: one f32, two bf16 or four int8 to a word, so that one
+//! register tile serves every [`Format`](super::operand::Format).
 //!
-//! A word of the left-hand side meets the words of a row of the panel; each lane adds the products of the numbers inside
-//! its word. Sums are f32, for int8 i32.
+//! A word of the left-hand side meets the words of a row of the panel; each lane adds the products
+//! of the numbers inside its word. Sums are f32, for int8 i32.
 
 use super::lanes::Lanes;
 #[cfg(target_arch = "x86_64")]
@@ -11,8 +11,8 @@ use std::arch::x86_64::*;
 /// A vector of words, or of sums.
 ///
 /// # Safety
-/// Every method may be called only where the instructions are available that the type stands for; pointers must be valid
-/// for `COUNT` words.
+/// Every method may be called only where the instructions are available that the type stands for;
+/// pointers must be valid for `COUNT` words.
 pub(super) trait Dot: Copy {
     /// Words per vector.
     const COUNT: usize;
@@ -59,7 +59,8 @@ macro_rules! portable {
         #[derive(Clone, Copy)]
         pub(super) struct $name([u32; 8]);
 
-        // SAFETY (every block): the caller vouches for eight words; reads and writes need not be aligned.
+        // SAFETY (every block): the caller vouches for eight words; reads and writes need not be
+        // aligned.
         impl Dot for $name {
             const COUNT: usize = 8;
 
@@ -112,7 +113,8 @@ portable!(
 #[derive(Clone, Copy)]
 pub(super) struct Avx512Bf16(__m512);
 
-// SAFETY (every block): the trait's contract is that AVX-512 F and BF16 are available and pointers are valid.
+// SAFETY (every block): the trait's contract is that AVX-512 F and BF16 are available and pointers
+// are valid.
 #[cfg(target_arch = "x86_64")]
 impl Dot for Avx512Bf16 {
     const COUNT: usize = 16;
@@ -146,7 +148,8 @@ impl Dot for Avx512Bf16 {
 #[derive(Clone, Copy)]
 pub(super) struct Avx512Int8(__m512i);
 
-// SAFETY (every block): the trait's contract is that AVX-512 F and VNNI are available and pointers are valid.
+// SAFETY (every block): the trait's contract is that AVX-512 F and VNNI are available and pointers
+// are valid.
 #[cfg(target_arch = "x86_64")]
 impl Dot for Avx512Int8 {
     const COUNT: usize = 16;

@@ -1,5 +1,5 @@
-//! What a transformer does between its matrix products: LayerNorm, softmax, and the epilogues that add bias, GELU and
-//! residual to a product while it is still in the first-level cache.
+//! What a transformer does between its matrix products: LayerNorm, softmax, and the epilogues that
+//! add bias, GELU and residual to a product while it is still in the first-level cache.
 
 mod polynomials;
 
@@ -26,7 +26,12 @@ pub enum Epilogue {
 
 impl Epilogue {
     /// Every epilogue.
-    const ALL: [Self; 4] = [Self::Bias, Self::BiasGelu, Self::BiasShortGelu, Self::BiasResidual];
+    const ALL: [Self; 4] = [
+        Self::Bias,
+        Self::BiasGelu,
+        Self::BiasShortGelu,
+        Self::BiasResidual,
+    ];
 }
 
 /// A finished block of a matrix product, `[rows, columns]` with `columns` as in [`Tiling`].
@@ -48,13 +53,27 @@ pub struct Product<'a> {
 ///
 /// # Panics
 /// If a slice is too short.
-pub fn finish_block(simd: Simd, epilogue: Epilogue, product: Product<'_>, out: &mut [f32], out_stride: usize) {
+pub fn finish_block(
+    simd: Simd,
+    epilogue: Epilogue,
+    product: Product<'_>,
+    out: &mut [f32],
+    out_stride: usize,
+) {
     if product.rows == 0 {
         return;
     }
     let columns = product.check(simd);
-    assert!(covers(out.len(), product.rows, out_stride, columns), "result too short");
-    let job = FinishJob { columns, product, out: out.as_mut_ptr(), out_stride };
+    assert!(
+        covers(out.len(), product.rows, out_stride, columns),
+        "result too short"
+    );
+    let job = FinishJob {
+        columns,
+        product,
+        out: out.as_mut_ptr(),
+        out_stride,
+    };
     at_level!(
         simd,
         (job: &FinishJob<'_, f32> = &job, epilogue: Epilogue = epilogue),
@@ -64,12 +83,12 @@ pub fn finish_block(simd: Simd, epilogue: Epilogue, product: Product<'_>, out: &
     );
 }
 
-/// As [`finish_block`] but for the residual, in `format`: row `i` of `out` starts at `i * out_stride` and has
-/// [`Format::words`] of the product's columns.
+/// As [`finish_block`] but for the residual, in `format`: row `i` of `out` starts at `i *
+/// out_stride` and has [`Format::words`] of the product's columns.
 ///
 /// # Panics
-/// If a slice is too short, the epilogue is [`Epilogue::BiasResidual`], or the format is int8 or not available at this
-/// level.
+/// If a slice is too short, the epilogue is [`Epilogue::BiasResidual`], or the format is int8 or
+/// not available at this level.
 pub fn finish_words(
     simd: Simd,
     format: Format,
@@ -78,16 +97,33 @@ pub fn finish_words(
     out: &mut [u32],
     out_stride: usize,
 ) {
-    assert!(format != Format::Int8 && epilogue != Epilogue::BiasResidual, "{epilogue:?} does not end in {format:?}");
+    assert!(
+        format != Format::Int8 && epilogue != Epilogue::BiasResidual,
+        "{epilogue:?} does not end in {format:?}"
+    );
     if format == Format::F32 {
-        return finish_block(simd, epilogue, product, bytemuck::cast_slice_mut(out), out_stride);
+        return finish_block(
+            simd,
+            epilogue,
+            product,
+            bytemuck::cast_slice_mut(out),
+            out_stride,
+        );
     }
     if product.rows == 0 {
         return;
     }
     let columns = product.check(simd);
-    assert!(covers(out.len(), product.rows, out_stride, format.words(columns)), "result too short");
-    let job = FinishJob { columns, product, out: out.as_mut_ptr(), out_stride };
+    assert!(
+        covers(out.len(), product.rows, out_stride, format.words(columns)),
+        "result too short"
+    );
+    let job = FinishJob {
+        columns,
+        product,
+        out: out.as_mut_ptr(),
+        out_stride,
+    };
     at_bf16_level!(
         simd,
         (job: &FinishJob<'_, u32> = &job, epilogue: Epilogue = epilogue),
@@ -101,8 +137,14 @@ impl Product<'_> {
     /// Its columns, after looking at how long its slices are.
     fn check(&self, simd: Simd) -> usize {
         let (columns, rows) = (Tiling::of(simd).columns, self.rows);
-        assert!(covers(self.block.len(), rows, columns, columns), "block too short");
-        assert!(self.bias.is_none_or(|bias| bias.len() >= columns), "bias too short");
+        assert!(
+            covers(self.block.len(), rows, columns, columns),
+            "block too short"
+        );
+        assert!(
+            self.bias.is_none_or(|bias| bias.len() >= columns),
+            "bias too short"
+        );
         if let Some(codes) = self.codes {
             assert!(self.factors.len() >= rows, "factors of the rows too short");
             assert!(
@@ -134,7 +176,9 @@ impl FinishJob<'_, f32> {
                     value.add(V::load(place)).store(place);
                 });
             } else {
-                self.activated::<V>(epilogue, |value, row, column| value.store(place(row, column)));
+                self.activated::<V>(epilogue, |value, row, column| {
+                    value.store(place(row, column))
+                });
             }
         }
     }
@@ -145,22 +189,30 @@ impl FinishJob<'_, u32> {
     unsafe fn run_bf16<V: Lanes>(&self, epilogue: Epilogue) {
         // SAFETY: `finish_words` has checked the extents.
         unsafe {
-            let place = |row: usize, column: usize| self.out.add(row * self.out_stride + column / 2);
-            self.activated::<V>(epilogue, |value, row, column| value.store_bf16(place(row, column)));
+            let place =
+                |row: usize, column: usize| self.out.add(row * self.out_stride + column / 2);
+            self.activated::<V>(epilogue, |value, row, column| {
+                value.store_bf16(place(row, column))
+            });
         }
     }
 }
 
 impl<T> FinishJob<'_, T> {
-    /// Every vector of the product with its bias and through its activation, its row and its column.
+    /// Every vector of the product with its bias and through its activation, its row and its
+    /// column.
     #[inline(always)]
     unsafe fn activated<V: Lanes>(&self, epilogue: Epilogue, finish: impl Fn(V, usize, usize)) {
         // SAFETY: the caller's.
         unsafe {
             match epilogue {
-                Epilogue::BiasGelu => self.each::<V>(|value, row, column| finish(gelu(value, &GELU), row, column)),
+                Epilogue::BiasGelu => {
+                    self.each::<V>(|value, row, column| finish(gelu(value, &GELU), row, column))
+                }
                 Epilogue::BiasShortGelu => {
-                    self.each::<V>(|value, row, column| finish(gelu(value, &GELU_SHORT), row, column));
+                    self.each::<V>(|value, row, column| {
+                        finish(gelu(value, &GELU_SHORT), row, column)
+                    });
                 }
                 Epilogue::Bias | Epilogue::BiasResidual => self.each::<V>(finish),
             }
@@ -170,14 +222,23 @@ impl<T> FinishJob<'_, T> {
     /// Every vector of the product with its bias, its row and its column.
     #[inline(always)]
     unsafe fn each<V: Lanes>(&self, finish: impl Fn(V, usize, usize)) {
-        let Product { rows, block, codes, factors, bias } = self.product;
+        let Product {
+            rows,
+            block,
+            codes,
+            factors,
+            bias,
+        } = self.product;
         for column in (0..self.columns).step_by(V::COUNT) {
-            // SAFETY: the extents are checked, and `columns` is a multiple of every vector's length; offsets are 32
-            // bits wide like floats.
+            // SAFETY: the extents are checked, and `columns` is a multiple of every vector's
+            // length; offsets are 32 bits wide like floats.
             unsafe {
                 let bias = bias.map_or(V::splat(0.0), |bias| V::load(bias.as_ptr().add(column)));
                 let codes = codes.map(|codes| {
-                    (V::load(codes.factors.as_ptr().add(column)), V::load(codes.offsets.as_ptr().add(column).cast()))
+                    (
+                        V::load(codes.factors.as_ptr().add(column)),
+                        V::load(codes.offsets.as_ptr().add(column).cast()),
+                    )
                 });
                 for row in 0..rows {
                     let sum = V::load(block.as_ptr().add(row * self.columns + column));
@@ -195,8 +256,8 @@ impl<T> FinishJob<'_, T> {
     }
 }
 
-/// Rows of `input` to zero mean and unit variance: LayerNorm without its scale and shift, which belong into the
-/// linear layer that follows. Both are `[rows, dim]`.
+/// Rows of `input` to zero mean and unit variance: LayerNorm without its scale and shift, which
+/// belong into the linear layer that follows. Both are `[rows, dim]`.
 ///
 /// # Panics
 /// If `out` is not as long as `input`.
@@ -241,7 +302,10 @@ unsafe fn fold<V: Lanes>(row: &[f32], fill: f32, add: impl Fn(V, V) -> V) -> f32
             sum = add(sum, V::load(row.as_ptr().add(at)));
         }
         if whole < row.len() {
-            sum = add(sum, V::load_partial(row.as_ptr().add(whole), row.len() - whole, fill));
+            sum = add(
+                sum,
+                V::load_partial(row.as_ptr().add(whole), row.len() - whole, fill),
+            );
         }
         sum.sum()
     }
@@ -262,9 +326,10 @@ unsafe fn map<V: Lanes>(row: &[f32], out: &mut [f32], apply: impl Fn(V) -> V) {
     }
 }
 
-/// Replaces a row of scores, already multiplied by log2(e), by `2^(score - maximum)` and gives the reciprocal of their
-/// sum: softmax but for one multiplication, which costs less after the next product. In bf16 the results take the first
-/// half of the row, two to a word, a lone last one beside a zero.
+/// Replaces a row of scores, already multiplied by log2(e), by `2^(score - maximum)` and gives the
+/// reciprocal of their sum: softmax but for one multiplication, which costs less after the next
+/// product. In bf16 the results take the first half of the row, two to a word, a lone last one
+/// beside a zero.
 ///
 /// # Panics
 /// If the format is int8, or not available at this level.
@@ -290,11 +355,14 @@ pub fn exponentiate_row(simd: Simd, format: Format, scores: &mut [f32]) -> f32 {
 
 #[inline(always)]
 unsafe fn exponentiate<V: Lanes, const BF16: bool>(scores: &mut [f32]) -> f32 {
-    // SAFETY: whole vectors stay inside `scores`, the rest is loaded and stored partially, in bf16 in half its room.
-    // Results never lie beyond the scores read so far.
+    // SAFETY: whole vectors stay inside `scores`, the rest is loaded and stored partially, in bf16
+    // in half its room. Results never lie beyond the scores read so far.
     unsafe {
         let (start, len) = (scores.as_mut_ptr(), scores.len());
-        let (pairs, whole) = (len / (2 * V::COUNT) * (2 * V::COUNT), len / V::COUNT * V::COUNT);
+        let (pairs, whole) = (
+            len / (2 * V::COUNT) * (2 * V::COUNT),
+            len / V::COUNT * V::COUNT,
+        );
         let mut highest = [V::splat(f32::NEG_INFINITY); 2];
         for at in (0..pairs).step_by(2 * V::COUNT) {
             highest[0] = highest[0].max(V::load(start.add(at)));
@@ -307,7 +375,11 @@ unsafe fn exponentiate<V: Lanes, const BF16: bool>(scores: &mut [f32]) -> f32 {
         let highest = V::splat(highest[0].max(highest[1]).maximum());
         let power = |value: V| exp2(value.sub(highest), if BF16 { &EXP2_SHORT } else { &EXP2 });
         let store = |value: V, at: usize| {
-            if BF16 { value.store_bf16(start.cast::<u32>().add(at / 2)) } else { value.store(start.add(at)) }
+            if BF16 {
+                value.store_bf16(start.cast::<u32>().add(at / 2))
+            } else {
+                value.store(start.add(at))
+            }
         };
         let mut sums = [V::splat(0.0); 2];
         for at in (0..pairs).step_by(2 * V::COUNT) {
@@ -337,13 +409,16 @@ unsafe fn exponentiate<V: Lanes, const BF16: bool>(scores: &mut [f32]) -> f32 {
     }
 }
 
-/// `row *= factor` for the first `factors.len()` rows of `columns` elements, row `i` starting at `i * stride`.
+/// `row *= factor` for the first `factors.len()` rows of `columns` elements, row `i` starting at `i
+/// * stride`.
 ///
 /// # Panics
 /// If `out` is too short.
 pub fn scale_rows(factors: &[f32], columns: usize, out: &mut [f32], stride: usize) {
     for (row, &factor) in factors.iter().enumerate() {
-        out[row * stride..row * stride + columns].iter_mut().for_each(|value| *value *= factor);
+        out[row * stride..row * stride + columns]
+            .iter_mut()
+            .for_each(|value| *value *= factor);
     }
 }
 
@@ -355,7 +430,11 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
         let mut normed = vec![0.0; len];
         normalize_rows(simd, len, 1e-6, &row, &mut normed);
         let mean = row.iter().map(|&x| f64::from(x)).sum::<f64>() / len as f64;
-        let variance = row.iter().map(|&x| (f64::from(x) - mean).powi(2)).sum::<f64>() / len as f64;
+        let variance = row
+            .iter()
+            .map(|&x| (f64::from(x) - mean).powi(2))
+            .sum::<f64>()
+            / len as f64;
         let mut scores = row.clone();
         let reciprocal = exponentiate_row(simd, Format::F32, &mut scores);
         let highest = row.iter().copied().fold(f32::MIN, f32::max);
@@ -363,11 +442,17 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
         for (index, &x) in row.iter().enumerate() {
             let expected = (f64::from(x) - mean) / (variance + 1e-6).sqrt();
             if differ(normed[index], expected, 1e-4) {
-                return Err(format!("LayerNorm of {len}: {} is not {expected}", normed[index]));
+                return Err(format!(
+                    "LayerNorm of {len}: {} is not {expected}",
+                    normed[index]
+                ));
             }
             let expected = f64::from(x - highest).exp2() / total;
             if differ(scores[index] * reciprocal, expected, 1e-6) {
-                return Err(format!("softmax of {len}: {} is not {expected}", scores[index] * reciprocal));
+                return Err(format!(
+                    "softmax of {len}: {} is not {expected}",
+                    scores[index] * reciprocal
+                ));
             }
         }
     }
@@ -377,11 +462,20 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
 fn check_epilogues(simd: Simd) -> Result<(), String> {
     use super::testing::{differ, ramp};
     let (columns, rows) = (Tiling::of(simd).columns, 5);
-    let block: Vec<f32> = ramp(rows * columns, 6).iter().map(|value| value * 6.0).collect();
+    let block: Vec<f32> = ramp(rows * columns, 6)
+        .iter()
+        .map(|value| value * 6.0)
+        .collect();
     let (bias, before) = (ramp(columns, 7), ramp(rows * (columns + 3), 8));
     for epilogue in Epilogue::ALL {
         let mut out = before.clone();
-        finish_block(simd, epilogue, plain(rows, &block, &bias), &mut out, columns + 3);
+        finish_block(
+            simd,
+            epilogue,
+            plain(rows, &block, &bias),
+            &mut out,
+            columns + 3,
+        );
         for (index, &actual) in out.iter().enumerate() {
             let (row, column) = (index / (columns + 3), index % (columns + 3));
             let expected = if column >= columns {
@@ -396,27 +490,63 @@ fn check_epilogues(simd: Simd) -> Result<(), String> {
                     Epilogue::BiasResidual => value + f64::from(before[index]),
                 }
             };
-            let tolerance = if epilogue == Epilogue::BiasShortGelu { 1e-4 } else { 4e-6 };
+            let tolerance = if epilogue == Epilogue::BiasShortGelu {
+                1e-4
+            } else {
+                4e-6
+            };
             if differ(actual, expected, tolerance) {
-                return Err(format!("{epilogue:?} at row {row}, column {column}: {actual} is not {expected}"));
+                return Err(format!(
+                    "{epilogue:?} at row {row}, column {column}: {actual} is not {expected}"
+                ));
             }
         }
     }
-    if Format::Bf16.is_available(simd) { check_rounded_epilogues(simd, &block, rows) } else { Ok(()) }
+    if Format::Bf16.is_available(simd) {
+        check_rounded_epilogues(simd, &block, rows)
+    } else {
+        Ok(())
+    }
 }
 
-/// Epilogues that end in bf16 against those in f32, rounded here; rows lie apart, and what is between them must stay.
+/// Epilogues that end in bf16 against those in f32, rounded here; rows lie apart, and what is
+/// between them must stay.
 fn check_rounded_epilogues(simd: Simd, block: &[f32], rows: usize) -> Result<(), String> {
     let columns = Tiling::of(simd).columns;
     let (exact_stride, stride, untouched) = (columns + 3, columns / 2 + 3, 7);
-    for epilogue in Epilogue::ALL.into_iter().filter(|&epilogue| epilogue != Epilogue::BiasResidual) {
-        let (mut exact, mut rounded) = (vec![0.0; rows * exact_stride], vec![untouched; rows * stride]);
-        finish_block(simd, epilogue, plain(rows, block, block), &mut exact, exact_stride);
-        finish_words(simd, Format::Bf16, epilogue, plain(rows, block, block), &mut rounded, stride);
+    for epilogue in Epilogue::ALL
+        .into_iter()
+        .filter(|&epilogue| epilogue != Epilogue::BiasResidual)
+    {
+        let (mut exact, mut rounded) = (
+            vec![0.0; rows * exact_stride],
+            vec![untouched; rows * stride],
+        );
+        finish_block(
+            simd,
+            epilogue,
+            plain(rows, block, block),
+            &mut exact,
+            exact_stride,
+        );
+        finish_words(
+            simd,
+            Format::Bf16,
+            epilogue,
+            plain(rows, block, block),
+            &mut rounded,
+            stride,
+        );
         for (at, &word) in rounded.iter().enumerate() {
             let (row, column) = (at / stride, 2 * (at % stride));
-            let bits = |column: usize| u32::from(half::bf16::from_f32(exact[row * exact_stride + column]).to_bits());
-            let expected = if column < columns { bits(column) | bits(column + 1) << 16 } else { untouched };
+            let bits = |column: usize| {
+                u32::from(half::bf16::from_f32(exact[row * exact_stride + column]).to_bits())
+            };
+            let expected = if column < columns {
+                bits(column) | bits(column + 1) << 16
+            } else {
+                untouched
+            };
             if word != expected {
                 return Err(format!(
                     "{epilogue:?} in bf16 at row {row}, column {column}: {word:x} is not {expected:x}"
@@ -428,7 +558,13 @@ fn check_rounded_epilogues(simd: Simd, block: &[f32], rows: usize) -> Result<(),
 }
 
 fn plain<'a>(rows: usize, block: &'a [f32], bias: &'a [f32]) -> Product<'a> {
-    Product { rows, block, codes: None, factors: &[], bias: Some(bias) }
+    Product {
+        rows,
+        block,
+        codes: None,
+        factors: &[],
+        bias: Some(bias),
+    }
 }
 
 /// erf by its Maclaurin series, whose terms f64 can hold up to about 5.

@@ -1,13 +1,14 @@
-//! Matrix products with the right-hand side packed once: the linear layers of the transformer, and the two products
-//! of attention, in any [`Format`].
+//! Matrix products with the right-hand side packed once: the linear layers of the transformer, and
+//! the two products of attention, in any [`Format`].
 //!
-//! The right-hand side lies in panels of [`Tiling::columns`] columns, `[panel][k in words][columns]`, so that a register
-//! tile of [`Tiling::rows`] x `columns` sums reads it in order. The left-hand side stays row-major. One call multiplies a
-//! whole block of rows with one panel, which thereby stays in the first-level cache, and leaves a small dense block that
-//! the caller's epilogue reads while it is hot.
+//! The right-hand side lies in panels of [`Tiling::columns`] columns, `[panel][k in
+//! words][columns]`, so that a register tile of [`Tiling::rows`] x `columns` sums reads it in
+//! order. The left-hand side stays row-major. One call multiplies a whole block of rows with one
+//! panel, which thereby stays in the first-level cache, and leaves a small dense block that the
+//! caller's epilogue reads while it is hot.
 //!
-//! Every sum runs over k in ascending order whatever the number of rows or threads, so a row's result depends on
-//! nothing but that row.
+//! Every sum runs over k in ascending order whatever the number of rows or threads, so a row's
+//! result depends on nothing but that row.
 
 use super::Simd;
 use super::aligned::AlignedBuffer;
@@ -27,7 +28,8 @@ use super::tiles;
 pub struct Tiling {
     /// Rows of the left-hand side.
     pub rows: usize,
-    /// Rows come in multiples of this; those that fill no tile are multiplied so many at a time, which is slower.
+    /// Rows come in multiples of this; those that fill no tile are multiplied so many at a time,
+    /// which is slower.
     pub row_step: usize,
     /// Columns of the right-hand side: the width of a panel.
     pub columns: usize,
@@ -37,11 +39,28 @@ impl Tiling {
     /// The tile of a level: as many sums as its registers hold beside one row of the panel.
     pub fn of(simd: Simd) -> Self {
         match simd.level() {
-            SimdLevel::Scalar => Self { rows: 4, row_step: 4, columns: 8 },
-            SimdLevel::Avx2 => Self { rows: 6, row_step: 2, columns: 16 },
-            SimdLevel::Avx512 => Self { rows: 12, row_step: 4, columns: 32 },
-            // Two matrix registers wide; their height, of which twice as many rows are taken at once where there are.
-            SimdLevel::Amx => Self { rows: 16, row_step: 16, columns: 32 },
+            SimdLevel::Scalar => Self {
+                rows: 4,
+                row_step: 4,
+                columns: 8,
+            },
+            SimdLevel::Avx2 => Self {
+                rows: 6,
+                row_step: 2,
+                columns: 16,
+            },
+            SimdLevel::Avx512 => Self {
+                rows: 12,
+                row_step: 4,
+                columns: 32,
+            },
+            // Two matrix registers wide; their height, of which twice as many rows are taken at
+            // once where there are.
+            SimdLevel::Amx => Self {
+                rows: 16,
+                row_step: 16,
+                columns: 32,
+            },
         }
     }
 }
@@ -72,8 +91,8 @@ pub struct PackedMatrix {
 }
 
 impl PackedMatrix {
-    /// Packs the matrix whose element in row `k` and column `n` is `element(k, n)`, to be multiplied by `slice` rows at
-    /// a time (k for all).
+    /// Packs the matrix whose element in row `k` and column `n` is `element(k, n)`, to be
+    /// multiplied by `slice` rows at a time (k for all).
     ///
     /// # Panics
     /// If slices are not whole words.
@@ -84,7 +103,10 @@ impl PackedMatrix {
         slice: usize,
         element: impl Fn(usize, usize) -> f32,
     ) -> Self {
-        assert!(slice >= k || slice.is_multiple_of(format.per_word()), "slices must be whole words");
+        assert!(
+            slice >= k || slice.is_multiple_of(format.per_word()),
+            "slices must be whole words"
+        );
         let (columns, words) = (Tiling::of(simd).columns, format.words(k));
         let (padded, slices) = (n.next_multiple_of(columns), k.div_ceil(slice.max(1)));
         let mut packed = Self {
@@ -95,20 +117,32 @@ impl PackedMatrix {
             columns,
             slice,
             factors: vec![0.0; if format == Format::Int8 { padded } else { 0 }],
-            offsets: vec![0; if format == Format::Int8 { padded * slices } else { 0 }],
+            offsets: vec![
+                0;
+                if format == Format::Int8 {
+                    padded * slices
+                } else {
+                    0
+                }
+            ],
         };
         let mut values = vec![0.0; words * format.per_word()];
         for column in 0..n {
-            values[..k].iter_mut().enumerate().for_each(|(row, value)| *value = element(row, column));
+            values[..k]
+                .iter_mut()
+                .enumerate()
+                .for_each(|(row, value)| *value = element(row, column));
             packed.pack_column(column, words, &values);
         }
         packed
     }
 
     fn pack_column(&mut self, column: usize, words: usize, values: &[f32]) {
-        let largest = values.iter().fold(f32::MIN_POSITIVE * 256.0, |a, b| a.max(b.abs()));
-        // Rounds to the nearest, ties to even, like `round_ties_even`, which is a call where SSE4.1 is not a given: beyond
-        // 2^23 floats have no fraction left.
+        let largest = values
+            .iter()
+            .fold(f32::MIN_POSITIVE * 256.0, |a, b| a.max(b.abs()));
+        // Rounds to the nearest, ties to even, like `round_ties_even`, which is a call where SSE4.1
+        // is not a given: beyond 2^23 floats have no fraction left.
         const TO_WHOLE: f32 = 12_582_912.0;
         let code = |value: f32| (value / largest * 127.0 + TO_WHOLE - TO_WHOLE) as i8;
         let place = column / self.columns * words * self.columns + column % self.columns;
@@ -119,14 +153,17 @@ impl PackedMatrix {
                     let bits = |value| u32::from(half::bf16::from_f32(value).to_bits());
                     bits(low) | bits(high) << 16
                 }
-                _ => u32::from_le_bytes(std::array::from_fn(|part| code(numbers[part]).cast_unsigned())),
+                _ => u32::from_le_bytes(std::array::from_fn(|part| {
+                    code(numbers[part]).cast_unsigned()
+                })),
             };
         }
         if self.format == Format::Int8 {
             self.factors[column] = largest / 127.0;
             let padded = self.factors.len();
             for (slice, values) in values[..self.k].chunks(self.slice).enumerate() {
-                self.offsets[slice * padded + column] = 128 * values.iter().map(|&v| i32::from(code(v))).sum::<i32>();
+                self.offsets[slice * padded + column] =
+                    128 * values.iter().map(|&v| i32::from(code(v))).sum::<i32>();
             }
         }
     }
@@ -149,7 +186,10 @@ impl PackedMatrix {
     /// Slice `slice` of one panel.
     pub fn panel(&self, panel: usize, slice: usize) -> Panel<'_> {
         let (from, to) = (slice * self.slice, self.k.min((slice + 1) * self.slice));
-        let (start, words) = (panel * self.format.words(self.k), self.format.words(to) - self.format.words(from));
+        let (start, words) = (
+            panel * self.format.words(self.k),
+            self.format.words(to) - self.format.words(from),
+        );
         let first = (start + self.format.words(from)) * self.columns;
         Panel::whole(&self.data[first..first + words * self.columns], words)
     }
@@ -166,7 +206,9 @@ impl PackedMatrix {
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        size_of_val::<[u32]>(&self.data) + size_of_val(&self.factors[..]) + size_of_val(&self.offsets[..])
+        size_of_val::<[u32]>(&self.data)
+            + size_of_val(&self.factors[..])
+            + size_of_val(&self.offsets[..])
     }
 }
 
@@ -186,13 +228,20 @@ pub struct Panel<'a> {
 impl<'a> Panel<'a> {
     /// A panel in one piece, `[k, columns]`.
     pub fn whole(data: &'a [u32], k: usize) -> Self {
-        Self { data, k, segment_rows: k.max(1), segment_stride: 0 }
+        Self {
+            data,
+            k,
+            segment_rows: k.max(1),
+            segment_stride: 0,
+        }
     }
 
-    /// Words up to the end of the segment that reaches farthest: the last, as long as segments do not lie across each
-    /// other; `None` if they do, or no memory holds that many.
+    /// Words up to the end of the segment that reaches farthest: the last, as long as segments do
+    /// not lie across each other; `None` if they do, or no memory holds that many.
     fn extent(&self, columns: usize) -> Option<usize> {
-        let Some(last) = self.k.checked_sub(1) else { return Some(0) };
+        let Some(last) = self.k.checked_sub(1) else {
+            return Some(0);
+        };
         let segment = last.checked_div(self.segment_rows)?;
         if segment > 0 && self.segment_stride < self.segment_rows.checked_mul(columns)? {
             return None;
@@ -202,8 +251,8 @@ impl<'a> Panel<'a> {
     }
 }
 
-/// Keeps this thread ready for products: where there are matrix registers, they stay configured until the last of these
-/// is dropped. Products do without, only slower.
+/// Keeps this thread ready for products: where there are matrix registers, they stay configured
+/// until the last of these is dropped. Products do without, only slower.
 #[must_use = "dropped at once, it speeds nothing up"]
 pub struct Readiness {
     #[cfg(target_arch = "x86_64")]
@@ -221,11 +270,13 @@ impl Readiness {
     }
 }
 
-/// `out = left x panel` for `rows` rows (a multiple of [`Tiling::row_step`]); row `i` of the result is the first
-/// `columns` elements at `out[i * out_stride]`. Both sides are in `format`; for int8 the results are the bits of i32.
+/// `out = left x panel` for `rows` rows (a multiple of [`Tiling::row_step`]); row `i` of the result
+/// is the first `columns` elements at `out[i * out_stride]`. Both sides are in `format`; for int8
+/// the results are the bits of i32.
 ///
 /// # Panics
-/// If a slice is too short for what it is said to hold, or the format is not available at this level.
+/// If a slice is too short for what it is said to hold, or the format is not available at this
+/// level.
 pub fn multiply_panel(
     simd: Simd,
     format: Format,
@@ -240,9 +291,20 @@ pub fn multiply_panel(
     if rows == 0 {
         return;
     }
-    assert!(covers(left.data.len(), rows, left.stride, panel.k), "left-hand side too short");
-    assert!(panel.extent(tile.columns).is_some_and(|extent| panel.data.len() >= extent), "panel too short");
-    assert!(covers(out.len(), rows, out_stride, tile.columns), "result too short");
+    assert!(
+        covers(left.data.len(), rows, left.stride, panel.k),
+        "left-hand side too short"
+    );
+    assert!(
+        panel
+            .extent(tile.columns)
+            .is_some_and(|extent| panel.data.len() >= extent),
+        "panel too short"
+    );
+    assert!(
+        covers(out.len(), rows, out_stride, tile.columns),
+        "result too short"
+    );
     let job = TileJob {
         rows,
         left: left.data.as_ptr(),
@@ -284,9 +346,12 @@ pub fn multiply_panel(
     }
 }
 
-/// Whether `len` elements hold `rows` (at least one) rows of `width`, each `stride` after the one before.
+/// Whether `len` elements hold `rows` (at least one) rows of `width`, each `stride` after the one
+/// before.
 pub(super) fn covers(len: usize, rows: usize, stride: usize, width: usize) -> bool {
-    let end = (rows - 1).checked_mul(stride).and_then(|start| start.checked_add(width));
+    let end = (rows - 1)
+        .checked_mul(stride)
+        .and_then(|start| start.checked_add(width));
     end.is_some_and(|end| len >= end)
 }
 
@@ -318,21 +383,24 @@ impl TileJob {
         };
         let mut rest = *self;
         if whole > 0 {
-            // SAFETY: `multiply_panel` has checked the extents, of which this is a part, and that rows are whole tiles;
-            // segments are whole steps.
+            // SAFETY: `multiply_panel` has checked the extents, of which this is a part, and that
+            // rows are whole tiles; segments are whole steps.
             unsafe { tiles::multiply(simd, format, &Self { k: whole, ..*self }) };
             if whole == self.k {
                 return;
             }
             let (segment, within) = (whole / self.segment_rows, whole % self.segment_rows);
             rest.left = self.left.wrapping_add(whole);
-            rest.right = self.right.wrapping_add(segment * self.segment_stride + within * Tiling::of(simd).columns);
+            rest.right = self
+                .right
+                .wrapping_add(segment * self.segment_stride + within * Tiling::of(simd).columns);
             rest.k -= whole;
             // What is left lies in one segment.
             rest.segment_rows = rest.k;
             rest.adds = true;
         }
-        // SAFETY: `multiply_panel` has checked the extents, of which this is the rest; AMX includes these instructions.
+        // SAFETY: `multiply_panel` has checked the extents, of which this is the rest; AMX includes
+        // these instructions.
         unsafe {
             match format {
                 Format::F32 => rest_f32(&rest),
@@ -345,31 +413,49 @@ impl TileJob {
     #[inline(always)]
     unsafe fn run<D: Dot, const MR: usize, const STEP: usize, const NV: usize>(&self) {
         let whole = self.rows / MR * MR;
-        // SAFETY: `multiply_panel` has checked that all rows, which are whole steps, lie inside both slices.
+        // SAFETY: `multiply_panel` has checked that all rows, which are whole steps, lie inside
+        // both slices.
         unsafe {
             for row in (0..whole).step_by(MR) {
-                self.tile::<D, MR, NV>(self.left.add(row * self.left_stride), self.out.add(row * self.out_stride));
+                self.tile::<D, MR, NV>(
+                    self.left.add(row * self.left_stride),
+                    self.out.add(row * self.out_stride),
+                );
             }
             for row in (whole..self.rows).step_by(STEP) {
-                self.tile::<D, STEP, NV>(self.left.add(row * self.left_stride), self.out.add(row * self.out_stride));
+                self.tile::<D, STEP, NV>(
+                    self.left.add(row * self.left_stride),
+                    self.out.add(row * self.out_stride),
+                );
             }
         }
     }
 
-    // Pointers advance by `wrapping_add` because builds with assertions check `add` at every step, which this loop cannot
-    // afford; `multiply_panel` has checked once that every access lies inside its slice.
-    #[allow(clippy::needless_range_loop, reason = "indices keep the sums in registers; iterators leave them in memory")]
+    // Pointers advance by `wrapping_add` because builds with assertions check `add` at every step,
+    // which this loop cannot afford; `multiply_panel` has checked once that every access lies
+    // inside its slice.
+    #[allow(
+        clippy::needless_range_loop,
+        reason = "indices keep the sums in registers; iterators leave them in memory"
+    )]
     #[inline(always)]
-    unsafe fn tile<D: Dot, const MR: usize, const NV: usize>(&self, left: *const u32, out: *mut u32) {
+    unsafe fn tile<D: Dot, const MR: usize, const NV: usize>(
+        &self,
+        left: *const u32,
+        out: *mut u32,
+    ) {
         let vectors: [usize; NV] = std::array::from_fn(|vector| vector * D::COUNT);
-        let mut rows: [*const u32; MR] = std::array::from_fn(|row| left.wrapping_add(row * self.left_stride));
-        // SAFETY: the extents were checked by `multiply_panel`; the level's instructions are available.
+        let mut rows: [*const u32; MR] =
+            std::array::from_fn(|row| left.wrapping_add(row * self.left_stride));
+        // SAFETY: the extents were checked by `multiply_panel`; the level's instructions are
+        // available.
         unsafe {
             let mut sums = [[D::zero(); NV]; MR];
             if self.adds {
                 for row in 0..MR {
                     for vector in 0..NV {
-                        sums[row][vector] = D::load(out.wrapping_add(row * self.out_stride + vectors[vector]));
+                        sums[row][vector] =
+                            D::load(out.wrapping_add(row * self.out_stride + vectors[vector]));
                     }
                 }
             }
@@ -396,14 +482,16 @@ impl TileJob {
             }
             for row in 0..MR {
                 for vector in 0..NV {
-                    sums[row][vector].store(out.wrapping_add(row * self.out_stride + vectors[vector]));
+                    sums[row][vector]
+                        .store(out.wrapping_add(row * self.out_stride + vectors[vector]));
                 }
             }
         }
     }
 }
 
-/// What tiles leave over, half a tile's height at a time: its sums fill half of the vector registers.
+/// What tiles leave over, half a tile's height at a time: its sums fill half of the vector
+/// registers.
 macro_rules! rest {
     ($name:ident, $dot:ty, $features:literal) => {
         /// # Safety
@@ -418,12 +506,23 @@ macro_rules! rest {
 }
 
 rest!(rest_f32, Avx512, "avx512f,avx512bw,avx512dq,avx512vl");
-rest!(rest_bf16, Avx512Bf16, "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16");
-rest!(rest_int8, Avx512Int8, "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni");
+rest!(
+    rest_bf16,
+    Avx512Bf16,
+    "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16"
+);
+rest!(
+    rest_int8,
+    Avx512Int8,
+    "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni"
+);
 
 /// The kernel against a plain sum on small odd sizes, in every format of the level.
 pub(super) fn check(simd: Simd) -> Result<(), String> {
-    for format in Format::ALL.into_iter().filter(|format| format.is_available(simd)) {
+    for format in Format::ALL
+        .into_iter()
+        .filter(|format| format.is_available(simd))
+    {
         for (k, n, slice) in [(16, 1, 16), (48, 37, 32), (64, 64, 64)] {
             compare_with_plain_sums(simd, format, 2, (k, n), slice)?;
         }
@@ -431,8 +530,8 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
     Ok(())
 }
 
-/// Multiplies as the transformer does, slice by slice through the epilogue, and compares with f64 sums over what both
-/// sides hold.
+/// Multiplies as the transformer does, slice by slice through the epilogue, and compares with f64
+/// sums over what both sides hold.
 fn compare_with_plain_sums(
     simd: Simd,
     format: Format,
@@ -446,9 +545,12 @@ fn compare_with_plain_sums(
     let (tile, stride) = (Tiling::of(simd), k + 3);
     let rows = tiles * tile.rows + tile.row_step;
     let (left, right) = (ramp(rows * stride, 1), ramp(k * n, 2));
-    let matrix = PackedMatrix::pack(simd, format, (k, n), slice, |row, column| right[row * n + column]);
+    let matrix = PackedMatrix::pack(simd, format, (k, n), slice, |row, column| {
+        right[row * n + column]
+    });
     let bias = vec![0.25; tile.columns];
-    // A code is off by half a step of its row or column; a sum of k products by what that adds up to, and rarely so much.
+    // A code is off by half a step of its row or column; a sum of k products by what that adds up
+    // to, and rarely so much.
     let tolerance = match format {
         Format::F32 => 1e-4,
         Format::Bf16 => 4e-3 * (k as f64).sqrt() + 1e-3,
@@ -461,16 +563,41 @@ fn compare_with_plain_sums(
             let width = slice.min(k - from);
             let packed = buffer.pack(simd, format, rows, width, (&left[from..], stride));
             let mut block = vec![f32::NAN; rows * tile.columns];
-            multiply_panel(simd, format, rows, packed.rows, matrix.panel(panel, index), &mut block, tile.columns);
+            multiply_panel(
+                simd,
+                format,
+                rows,
+                packed.rows,
+                matrix.panel(panel, index),
+                &mut block,
+                tile.columns,
+            );
             let bias = if index == 0 { Some(&bias[..]) } else { None };
-            let product =
-                Product { rows, block: &block, codes: matrix.codes(panel, index), factors: packed.factors, bias };
-            finish_block(simd, Epilogue::BiasResidual, product, &mut out, tile.columns);
+            let product = Product {
+                rows,
+                block: &block,
+                codes: matrix.codes(panel, index),
+                factors: packed.factors,
+                bias,
+            };
+            finish_block(
+                simd,
+                Epilogue::BiasResidual,
+                product,
+                &mut out,
+                tile.columns,
+            );
         }
         for (at, &actual) in out.iter().enumerate() {
             let (row, column) = (at / tile.columns, panel * tile.columns + at % tile.columns);
-            let term = |i: usize| f64::from(left[row * stride + i]) * f64::from(right[i * n + column]);
-            let expected = 0.75 + if column < n { (0..k).map(term).sum::<f64>() } else { 0.0 };
+            let term =
+                |i: usize| f64::from(left[row * stride + i]) * f64::from(right[i * n + column]);
+            let expected = 0.75
+                + if column < n {
+                    (0..k).map(term).sum::<f64>()
+                } else {
+                    0.0
+                };
             if differ(actual, expected, tolerance) {
                 return Err(format!(
                     "{format:?}, k {k}, n {n}, row {row}, column {column}: {actual} is not {expected}"

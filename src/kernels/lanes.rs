@@ -1,11 +1,13 @@
-//! One vector register of f32 at each level, so that an elementwise kernel is written once and compiled three times.
+//! One vector register of f32 at each level, so that an elementwise kernel is written once and
+//! compiled three times.
 //!
-//! A kernel is an `#[inline(always)]` function generic over [`Lanes`]; [`at_level!`] instantiates it inside one
-//! `#[target_feature]` function per level and picks among them by the [`Simd`](super::Simd) token. The portable
-//! instance is the scalar twin: plain Rust on arrays, no intrinsics.
+//! A kernel is an `#[inline(always)]` function generic over [`Lanes`]; [`at_level!`] instantiates
+//! it inside one `#[target_feature]` function per level and picks among them by the
+//! [`Simd`](super::Simd) token. The portable instance is the scalar twin: plain Rust on arrays, no
+//! intrinsics.
 //!
-//! `min` and `max` follow x86: where either operand is NaN they give the second, so a kernel decides by the order of
-//! its operands whether NaN survives.
+//! `min` and `max` follow x86: where either operand is NaN they give the second, so a kernel
+//! decides by the order of its operands whether NaN survives.
 
 #[cfg(target_arch = "x86_64")]
 use std::arch::x86_64::*;
@@ -16,8 +18,8 @@ pub(super) const ROUNDING: f32 = 12_582_912.0;
 /// A vector of f32.
 ///
 /// # Safety
-/// Every method may be called only where the level's instructions are available; pointers must be valid for `COUNT`
-/// elements.
+/// Every method may be called only where the level's instructions are available; pointers must be
+/// valid for `COUNT` elements.
 pub(super) trait Lanes: Copy {
     /// Elements per vector.
     const COUNT: usize;
@@ -41,8 +43,8 @@ pub(super) trait Lanes: Copy {
     unsafe fn sum(self) -> f32;
     unsafe fn maximum(self) -> f32;
 
-    /// Stores bf16, rounded to the nearest, two to a word: `COUNT / 2` words. At the highest level only where the CPU
-    /// has AVX-512 BF16.
+    /// Stores bf16, rounded to the nearest, two to a word: `COUNT / 2` words. At the highest level
+    /// only where the CPU has AVX-512 BF16.
     #[inline(always)]
     unsafe fn store_bf16(self, to: *mut u32) {
         let mut values = [0.0f32; 16];
@@ -51,7 +53,8 @@ pub(super) trait Lanes: Copy {
             self.store(values.as_mut_ptr());
             for (pair, values) in values[..Self::COUNT].chunks_exact(2).enumerate() {
                 let bits = |value: f32| u32::from(half::bf16::from_f32(value).to_bits());
-                to.add(pair).write_unaligned(bits(values[0]) | bits(values[1]) << 16);
+                to.add(pair)
+                    .write_unaligned(bits(values[0]) | bits(values[1]) << 16);
             }
         }
     }
@@ -91,7 +94,8 @@ pub(super) trait Lanes: Copy {
         }
     }
 
-    /// As [`store_bf16`](Self::store_bf16), the first `count` elements, a lone last one beside a zero.
+    /// As [`store_bf16`](Self::store_bf16), the first `count` elements, a lone last one beside a
+    /// zero.
     #[inline(always)]
     unsafe fn store_bf16_partial(self, to: *mut u32, count: usize) {
         let (mut values, mut words) = ([0.0f32; 16], [0u32; 8]);
@@ -120,12 +124,16 @@ pub(super) trait Lanes: Copy {
 #[repr(C, packed)]
 struct Unaligned<T>(T);
 
-/// The value at `place`. Where assertions are on, `read_unaligned` and the `loadu` intrinsics check for overlap, and a
-/// dereferenced pointer for null, at every call: the inner loops cannot afford either, and a reference is not checked.
+/// The value at `place`. Where assertions are on, `read_unaligned` and the `loadu` intrinsics check
+/// for overlap, and a dereferenced pointer for null, at every call: the inner loops cannot afford
+/// either, and a reference is not checked.
 ///
 /// # Safety
 /// `place` must be valid for reads of `T`; it need not be aligned.
-#[allow(clippy::transmute_ptr_to_ref, reason = "a dereferenced pointer is checked for null where assertions are on")]
+#[allow(
+    clippy::transmute_ptr_to_ref,
+    reason = "a dereferenced pointer is checked for null where assertions are on"
+)]
 #[inline(always)]
 unsafe fn read<T: Copy>(place: *const f32) -> T {
     // SAFETY: the caller's; the packed type needs no alignment.
@@ -137,7 +145,10 @@ unsafe fn read<T: Copy>(place: *const f32) -> T {
 ///
 /// # Safety
 /// `place` must be valid for writes of `T`; it need not be aligned.
-#[allow(clippy::transmute_ptr_to_ref, reason = "a dereferenced pointer is checked for null where assertions are on")]
+#[allow(
+    clippy::transmute_ptr_to_ref,
+    reason = "a dereferenced pointer is checked for null where assertions are on"
+)]
 #[inline(always)]
 unsafe fn write<T: Copy>(place: *mut f32, value: T) {
     // SAFETY: the caller's; the packed type needs no alignment.
@@ -152,7 +163,9 @@ pub(super) struct Portable([f32; 8]);
 impl Portable {
     #[inline(always)]
     fn zip(self, other: Self, apply: impl Fn(f32, f32) -> f32) -> Self {
-        Self(std::array::from_fn(|lane| apply(self.0[lane], other.0[lane])))
+        Self(std::array::from_fn(|lane| {
+            apply(self.0[lane], other.0[lane])
+        }))
     }
 }
 
@@ -192,7 +205,9 @@ impl Lanes for Portable {
     }
     #[inline(always)]
     unsafe fn mul_add(self, factor: Self, term: Self) -> Self {
-        Self(std::array::from_fn(|lane| self.0[lane] * factor.0[lane] + term.0[lane]))
+        Self(std::array::from_fn(|lane| {
+            self.0[lane] * factor.0[lane] + term.0[lane]
+        }))
     }
     #[inline(always)]
     unsafe fn min(self, other: Self) -> Self {
@@ -204,11 +219,15 @@ impl Lanes for Portable {
     }
     #[inline(always)]
     unsafe fn scale(self, n: Self) -> Self {
-        self.zip(n, |value, n| value * f32::from_bits((n + ROUNDING).to_bits().wrapping_add(127) << 23))
+        self.zip(n, |value, n| {
+            value * f32::from_bits((n + ROUNDING).to_bits().wrapping_add(127) << 23)
+        })
     }
     #[inline(always)]
     unsafe fn integer_difference(self, other: Self) -> Self {
-        self.zip(other, |a, b| a.to_bits().wrapping_sub(b.to_bits()).cast_signed() as f32)
+        self.zip(other, |a, b| {
+            a.to_bits().wrapping_sub(b.to_bits()).cast_signed() as f32
+        })
     }
     #[inline(always)]
     unsafe fn sum(self) -> f32 {
@@ -216,7 +235,9 @@ impl Lanes for Portable {
     }
     #[inline(always)]
     unsafe fn maximum(self) -> f32 {
-        self.0.iter().fold(f32::NEG_INFINITY, |a, &b| if a > b { a } else { b })
+        self.0
+            .iter()
+            .fold(f32::NEG_INFINITY, |a, &b| if a > b { a } else { b })
     }
 }
 
@@ -225,7 +246,8 @@ impl Lanes for Portable {
 #[derive(Clone, Copy)]
 pub(super) struct Avx2(pub(super) __m256);
 
-// SAFETY (every block): the trait's contract is that AVX2 and FMA are available and pointers are valid.
+// SAFETY (every block): the trait's contract is that AVX2 and FMA are available and pointers are
+// valid.
 #[cfg(target_arch = "x86_64")]
 impl Lanes for Avx2 {
     const COUNT: usize = 8;
@@ -275,7 +297,10 @@ impl Lanes for Avx2 {
         unsafe {
             let shifted = _mm256_castps_si256(_mm256_add_ps(n.0, _mm256_set1_ps(ROUNDING)));
             let biased = _mm256_add_epi32(shifted, _mm256_set1_epi32(127));
-            Self(_mm256_mul_ps(self.0, _mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased))))
+            Self(_mm256_mul_ps(
+                self.0,
+                _mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased)),
+            ))
         }
     }
     #[inline(always)]
@@ -288,7 +313,10 @@ impl Lanes for Avx2 {
     #[inline(always)]
     unsafe fn sum(self) -> f32 {
         unsafe {
-            let half = _mm_add_ps(_mm256_castps256_ps128(self.0), _mm256_extractf128_ps::<1>(self.0));
+            let half = _mm_add_ps(
+                _mm256_castps256_ps128(self.0),
+                _mm256_extractf128_ps::<1>(self.0),
+            );
             let quarter = _mm_add_ps(half, _mm_movehl_ps(half, half));
             _mm_cvtss_f32(_mm_add_ss(quarter, _mm_movehdup_ps(quarter)))
         }
@@ -296,7 +324,10 @@ impl Lanes for Avx2 {
     #[inline(always)]
     unsafe fn maximum(self) -> f32 {
         unsafe {
-            let half = _mm_max_ps(_mm256_castps256_ps128(self.0), _mm256_extractf128_ps::<1>(self.0));
+            let half = _mm_max_ps(
+                _mm256_castps256_ps128(self.0),
+                _mm256_extractf128_ps::<1>(self.0),
+            );
             let quarter = _mm_max_ps(half, _mm_movehl_ps(half, half));
             _mm_cvtss_f32(_mm_max_ss(quarter, _mm_movehdup_ps(quarter)))
         }
@@ -374,11 +405,21 @@ impl Lanes for Avx512 {
     #[inline(always)]
     unsafe fn store_bf16(self, to: *mut u32) {
         // A bit pattern of 256 bits is a valid vector of integers.
-        unsafe { write::<__m256i>(to.cast(), std::mem::transmute::<__m256bh, __m256i>(_mm512_cvtneps_pbh(self.0))) }
+        unsafe {
+            write::<__m256i>(
+                to.cast(),
+                std::mem::transmute::<__m256bh, __m256i>(_mm512_cvtneps_pbh(self.0)),
+            )
+        }
     }
     #[inline(always)]
     unsafe fn store_u8(self, to: *mut u8) {
-        unsafe { write::<__m128i>(to.cast(), _mm512_cvtusepi32_epi8(_mm512_cvtps_epi32(self.0))) }
+        unsafe {
+            write::<__m128i>(
+                to.cast(),
+                _mm512_cvtusepi32_epi8(_mm512_cvtps_epi32(self.0)),
+            )
+        }
     }
     #[inline(always)]
     unsafe fn load_partial(from: *const f32, count: usize, fill: f32) -> Self {
@@ -404,8 +445,8 @@ impl Lanes for Avx512 {
 
 /// Calls one of three instances of a kernel, each compiled for its level, by a `Simd` token.
 ///
-/// `at_level!(simd, (name: Type = value, ...) -> Return, portable expression, avx2 expression, avx512 expression)`:
-/// the expressions see the named arguments.
+/// `at_level!(simd, (name: Type = value, ...) -> Return, portable expression, avx2 expression,
+/// avx512 expression)`: the expressions see the named arguments.
 macro_rules! at_level {
     ($simd:expr, ($($name:ident: $type:ty = $value:expr),* $(,)?) $(-> $return:ty)?,
      $portable:expr, $avx2:expr, $avx512:expr $(,)?) => {
@@ -420,7 +461,8 @@ pub(super) use at_level;
 /// As [`at_level!`], for kernels whose highest instance uses AVX-512 BF16 too.
 ///
 /// # Panics
-/// At the highest level of a CPU without it: callers ask [`Format::is_available`](super::operand::Format) first.
+/// At the highest level of a CPU without it: callers ask
+/// [`Format::is_available`](super::operand::Format) first.
 macro_rules! at_bf16_level {
     ($simd:expr, ($($name:ident: $type:ty = $value:expr),* $(,)?) $(-> $return:ty)?,
      $portable:expr, $avx2:expr, $avx512:expr $(,)?) => {{
@@ -437,7 +479,8 @@ macro_rules! at_bf16_level {
 }
 pub(super) use at_bf16_level;
 
-/// What the two macros above share; the first argument is what the highest instance is compiled for.
+/// What the two macros above share; the first argument is what the highest instance is compiled
+/// for.
 macro_rules! instances {
     ($features:tt, $simd:expr, ($($name:ident: $type:ty = $value:expr),*) $(-> $return:ty)?,
      $portable:expr, $avx2:expr, $avx512:expr) => {{
@@ -460,7 +503,8 @@ macro_rules! instances {
         }
         match $simd.level() {
             #[cfg(target_arch = "x86_64")]
-            // SAFETY: the token proves the level; the surrounding function has checked the arguments.
+            // SAFETY: the token proves the level; the surrounding function has checked the
+            // arguments.
             $crate::kernels::SimdLevel::Avx512 | $crate::kernels::SimdLevel::Amx => unsafe { avx512($($value),*) },
             #[cfg(target_arch = "x86_64")]
             // SAFETY: the same.

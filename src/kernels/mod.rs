@@ -13,25 +13,35 @@
 //! | `lanes`, `tiles`, [`aligned`] | vector registers by level; matrix registers (AMX); buffers on cache lines |
 //! | `transpose` | words of rows to words of columns |
 //!
-//! Every kernel takes a [`Simd`] and has a portable twin, which tests compare it with over odd sizes. Where tests ran
-//! on a CPU without AVX-512 or AMX, that level is still guarded: [`self_check`] compares every kernel with its twin on the
-//! machine at hand before the program computes anything, and a level that disagrees is refused with an error.
+//! Every kernel takes a [`Simd`] and has a portable twin, which tests compare it with over odd
+//! sizes. Where tests ran on a CPU without AVX-512 or AMX, that level is still guarded:
+//! [`self_check`] compares every kernel with its twin on the machine at hand before the program
+//! computes anything, and a level that disagrees is refused with an error.
 
 pub mod aligned;
 pub mod attention;
 mod dot;
 pub mod elementwise;
 pub mod gemm;
-#[allow(clippy::needless_range_loop, reason = "lanes, corners and halves index several arrays at once")]
+#[allow(
+    clippy::needless_range_loop,
+    reason = "lanes, corners and halves index several arrays at once"
+)]
 pub mod homography;
 mod lanes;
 pub mod operand;
 pub mod peak;
-#[allow(clippy::needless_range_loop, reason = "lanes index several arrays at once")]
+#[allow(
+    clippy::needless_range_loop,
+    reason = "lanes index several arrays at once"
+)]
 pub mod quantise;
 pub mod scan;
 pub mod simd;
-#[allow(clippy::needless_range_loop, reason = "sections and halves index several arrays at once")]
+#[allow(
+    clippy::needless_range_loop,
+    reason = "sections and halves index several arrays at once"
+)]
 pub mod similarity;
 mod testing;
 #[cfg(target_arch = "x86_64")]
@@ -49,7 +59,8 @@ fn greatest_common_divisor(mut a: usize, mut b: usize) -> usize {
     a
 }
 
-/// Compares one kernel at one level with its scalar twin on small odd inputs; tells the first difference.
+/// Compares one kernel at one level with its scalar twin on small odd inputs; tells the first
+/// difference.
 type Check = fn(Simd) -> Result<(), String>;
 
 /// Every kernel's check, by the kernel's name.
@@ -63,8 +74,8 @@ const CHECKS: &[(&str, Check)] = &[
     ("attention", attention::check),
 ];
 
-/// Chooses the level and compares every kernel at it with its scalar twin: a few milliseconds, once in a process
-/// however often it is asked.
+/// Chooses the level and compares every kernel at it with its scalar twin: a few milliseconds, once
+/// in a process however often it is asked.
 ///
 /// # Errors
 /// `PLACEFORMER_SIMD` names no level or one this CPU lacks; or a kernel disagrees with its twin.
@@ -80,7 +91,11 @@ pub fn self_check() -> Result<Simd, SimdError> {
 
 fn check_level(simd: Simd, checks: &[(&'static str, Check)]) -> Result<(), SimdError> {
     for &(kernel, check) in checks {
-        check(simd).map_err(|difference| SimdError::Disagrees { kernel, level: simd.level(), difference })?;
+        check(simd).map_err(|difference| SimdError::Disagrees {
+            kernel,
+            level: simd.level(),
+            difference,
+        })?;
     }
     Ok(())
 }
@@ -98,8 +113,14 @@ mod tests {
 
     #[test]
     fn a_kernel_that_disagrees_is_refused_by_name() {
-        let wrong: &[(&str, Check)] = &[("fine", |_| Ok(())), ("broken", |_| Err("3 is not 4".into()))];
+        let wrong: &[(&str, Check)] = &[
+            ("fine", |_| Ok(())),
+            ("broken", |_| Err("3 is not 4".into())),
+        ];
         let error = check_level(Simd::SCALAR, wrong).unwrap_err().to_string();
-        assert!(error.contains("broken") && error.contains("3 is not 4"), "{error}");
+        assert!(
+            error.contains("broken") && error.contains("3 is not 4"),
+            "{error}"
+        );
     }
 }

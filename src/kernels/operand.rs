@@ -1,7 +1,7 @@
 //! How the numbers of a product are stored, and left-hand sides packed so.
 //!
-//! A product of f32 costs four bytes a number and one multiply-add a lane; bf16 halves and int8 quarters both. Sums stay
-//! f32 (i32 for int8), and so does everything between the products.
+//! A product of f32 costs four bytes a number and one multiply-add a lane; bf16 halves and int8
+//! quarters both. Sums stay f32 (i32 for int8), and so does everything between the products.
 
 use super::Simd;
 use super::aligned::AlignedBuffer;
@@ -11,15 +11,16 @@ use super::lanes::{Avx2, Avx512};
 use super::lanes::{Lanes, Portable, at_bf16_level, at_level};
 use super::simd::SimdLevel;
 
-/// How the numbers on both sides of a product are stored, always in whole 32-bit words along the sum.
+/// How the numbers on both sides of a product are stored, always in whole 32-bit words along the
+/// sum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Format {
     /// One 32-bit float to a word.
     F32,
     /// Two bfloat16, rounded to the nearest, the earlier in the low half.
     Bf16,
-    /// Four integers with a factor for each row: on the left unsigned, value = (code - 128) x factor; on the right
-    /// signed with a factor for each column.
+    /// Four integers with a factor for each row: on the left unsigned, value = (code - 128) x
+    /// factor; on the right signed with a factor for each column.
     Int8,
 }
 
@@ -41,7 +42,8 @@ impl Format {
         count.div_ceil(self.per_word())
     }
 
-    /// Whether the level has an instruction for it, or is the portable one, which can everything and slowly.
+    /// Whether the level has an instruction for it, or is the portable one, which can everything
+    /// and slowly.
     pub fn is_available(self, simd: Simd) -> bool {
         match self {
             Self::F32 => true,
@@ -63,7 +65,10 @@ pub struct Rows<'a> {
 impl<'a> Rows<'a> {
     /// Rows of f32 as they are.
     pub fn f32(data: &'a [f32], stride: usize) -> Self {
-        Self { data: bytemuck::cast_slice(data), stride }
+        Self {
+            data: bytemuck::cast_slice(data),
+            stride,
+        }
     }
 }
 
@@ -79,8 +84,18 @@ pub struct Left<'a> {
 impl Left<'_> {
     /// What is left of it from row `first` on.
     pub fn from_row(&self, first: usize) -> Self {
-        let rows = Rows { data: &self.rows.data[first * self.rows.stride..], ..self.rows };
-        Self { rows, factors: if self.factors.is_empty() { &[] } else { &self.factors[first..] } }
+        let rows = Rows {
+            data: &self.rows.data[first * self.rows.stride..],
+            ..self.rows
+        };
+        Self {
+            rows,
+            factors: if self.factors.is_empty() {
+                &[]
+            } else {
+                &self.factors[first..]
+            },
+        }
     }
 }
 
@@ -93,15 +108,20 @@ pub struct OperandBuffer {
 
 /// Widths that [`OperandBuffer::pack`] takes are multiples of this: a vector's length.
 pub fn width_step(simd: Simd) -> usize {
-    if simd.level() >= SimdLevel::Avx512 { 16 } else { 8 }
+    if simd.level() >= SimdLevel::Avx512 {
+        16
+    } else {
+        8
+    }
 }
 
 impl OperandBuffer {
-    /// `rows` rows of `width` f32, row `i` at `i * stride`, in `format`: as they are for f32, else packed into the
-    /// buffer.
+    /// `rows` rows of `width` f32, row `i` at `i * stride`, in `format`: as they are for f32, else
+    /// packed into the buffer.
     ///
     /// # Panics
-    /// If `source` is too short, or `width` is not a multiple of [`width_step`], or the format is not available.
+    /// If `source` is too short, or `width` is not a multiple of [`width_step`], or the format is
+    /// not available.
     pub fn pack<'a>(
         &'a mut self,
         simd: Simd,
@@ -127,29 +147,46 @@ impl OperandBuffer {
         channels: Channels<'_>,
     ) -> Left<'a> {
         if format == Format::F32 {
-            return Left { rows: Rows::f32(source, stride), factors: &[] };
+            return Left {
+                rows: Rows::f32(source, stride),
+                factors: &[],
+            };
         }
         let checked = SourceRows::new(simd, (source, stride), rows, width);
         let words = format.words(width);
         self.words.resize(rows * words);
-        self.factors.resize(if format == Format::Int8 { rows } else { 0 });
+        self.factors
+            .resize(if format == Format::Int8 { rows } else { 0 });
         if format == Format::Bf16 {
             round_rows(simd, checked, &mut self.words);
         } else {
-            quantise_rows(simd, checked, channels, (&mut self.words, words), &mut self.factors);
+            quantise_rows(
+                simd,
+                checked,
+                channels,
+                (&mut self.words, words),
+                &mut self.factors,
+            );
         }
-        Left { rows: Rows { data: &self.words, stride: words }, factors: &self.factors }
+        Left {
+            rows: Rows {
+                data: &self.words,
+                stride: words,
+            },
+            factors: &self.factors,
+        }
     }
 
-    /// Room for `rows` rows of `width` numbers in `format`, a row after the other, for an epilogue to fill.
+    /// Room for `rows` rows of `width` numbers in `format`, a row after the other, for an epilogue
+    /// to fill.
     pub fn rows(&mut self, format: Format, rows: usize, width: usize) -> &mut [u32] {
         self.words.resize(rows * format.words(width));
         &mut self.words
     }
 }
 
-/// Codes of `factors.len()` rows of `width` f32 as in [`Format::Int8`] on the left, row `i` from `i * stride` of `source`
-/// to `i * out_stride` of `out`, and what a code of each is worth.
+/// Codes of `factors.len()` rows of `width` f32 as in [`Format::Int8`] on the left, row `i` from `i
+/// * stride` of `source` to `i * out_stride` of `out`, and what a code of each is worth.
 ///
 /// # Panics
 /// If a slice is too short, or `width` is not a multiple of [`width_step`].
@@ -162,8 +199,17 @@ pub fn quantise_into(
 ) {
     let (rows, words) = (factors.len(), Format::Int8.words(width));
     let source = SourceRows::new(simd, source, rows, width);
-    assert!(rows == 0 || covers(out.len(), rows, out_stride, words), "result too short");
-    quantise_rows(simd, source, Channels::default(), (out, out_stride), factors);
+    assert!(
+        rows == 0 || covers(out.len(), rows, out_stride, words),
+        "result too short"
+    );
+    quantise_rows(
+        simd,
+        source,
+        Channels::default(),
+        (out, out_stride),
+        factors,
+    );
 }
 
 /// What becomes codes: `value * gain + shift`, by column; where both are empty, the value as it is.
@@ -187,9 +233,20 @@ impl SourceRows {
     /// # Panics
     /// If `source` is too short, or `width` is not a multiple of [`width_step`].
     fn new(simd: Simd, (source, stride): (&[f32], usize), rows: usize, width: usize) -> Self {
-        assert_eq!(width % width_step(simd), 0, "rows must be whole vectors wide");
-        assert!(rows == 0 || covers(source.len(), rows, stride, width), "source too short");
-        Self { source: source.as_ptr(), stride, width }
+        assert_eq!(
+            width % width_step(simd),
+            0,
+            "rows must be whole vectors wide"
+        );
+        assert!(
+            rows == 0 || covers(source.len(), rows, stride, width),
+            "source too short"
+        );
+        Self {
+            source: source.as_ptr(),
+            stride,
+            width,
+        }
     }
 
     /// Where one begins.
@@ -223,7 +280,8 @@ unsafe fn round<V: Lanes>(rows: SourceRows, packed: &mut [u32]) {
     }
 }
 
-/// Codes of as many rows as there are factors, the largest magnitude of each becoming 127, and what one is worth.
+/// Codes of as many rows as there are factors, the largest magnitude of each becoming 127, and what
+/// one is worth.
 fn quantise_rows(
     simd: Simd,
     rows: SourceRows,
@@ -232,7 +290,10 @@ fn quantise_rows(
     factors: &mut [f32],
 ) {
     let counts = (channels.gain.len(), channels.shift.len());
-    assert!(counts == (0, 0) || counts == (rows.width, rows.width), "every column needs its gain and shift");
+    assert!(
+        counts == (0, 0) || counts == (rows.width, rows.width),
+        "every column needs its gain and shift"
+    );
     at_level!(
         simd,
         (
@@ -257,13 +318,18 @@ unsafe fn quantise<V: Lanes>(
     factors: &mut [f32],
 ) {
     let Channels { gain, shift } = channels;
-    // SAFETY: there is a gain and a shift for every column, or the first is chosen; the rest is the caller's.
+    // SAFETY: there is a gain and a shift for every column, or the first is chosen; the rest is the
+    // caller's.
     unsafe {
         if gain.is_empty() {
             quantise_as::<V>(rows, |_, value| value, packed, stride, factors);
         } else {
             // Two roundings, as every level has them: the codes are the same everywhere.
-            let scaled = |at, value: V| value.mul(V::load(gain.as_ptr().add(at))).add(V::load(shift.as_ptr().add(at)));
+            let scaled = |at, value: V| {
+                value
+                    .mul(V::load(gain.as_ptr().add(at)))
+                    .add(V::load(shift.as_ptr().add(at)))
+            };
             quantise_as::<V>(rows, scaled, packed, stride, factors);
         }
     }
@@ -290,7 +356,9 @@ unsafe fn quantise_as<V: Lanes>(
             let (scale, centre) = (V::splat(127.0 / largest), V::splat(128.0));
             for at in (0..rows.width).step_by(V::COUNT) {
                 // Two roundings here too.
-                let code = scaled(at, V::load(rows.row(index).add(at))).mul(scale).add(centre);
+                let code = scaled(at, V::load(rows.row(index).add(at)))
+                    .mul(scale)
+                    .add(centre);
                 code.store_u8(packed.add(at));
             }
             *factor = largest / 127.0;
@@ -310,7 +378,9 @@ pub(super) fn unpack(format: Format, left: Left<'_>, rows: usize, width: usize) 
             Format::Int8 => (f32::from(word.to_le_bytes()[part]) - 128.0) * left.factors[row],
         }
     };
-    (0..rows * width).map(|at| value(at / width, at % width)).collect()
+    (0..rows * width)
+        .map(|at| value(at / width, at % width))
+        .collect()
 }
 
 #[cfg(test)]
@@ -362,8 +432,18 @@ mod tests {
     #[test]
     #[should_panic(expected = "every column needs its gain and shift")]
     fn channels_that_are_too_few_are_refused() {
-        let channels = Channels { gain: &[1.0; 16], shift: &[0.0; 15] };
-        OperandBuffer::default().pack_scaled(Simd::SCALAR, Format::Int8, 1, 16, (&[1.0; 16], 16), channels);
+        let channels = Channels {
+            gain: &[1.0; 16],
+            shift: &[0.0; 15],
+        };
+        OperandBuffer::default().pack_scaled(
+            Simd::SCALAR,
+            Format::Int8,
+            1,
+            16,
+            (&[1.0; 16], 16),
+            channels,
+        );
     }
 
     #[test]
@@ -376,7 +456,11 @@ mod tests {
         for simd in Simd::all().filter(|&simd| Format::Bf16.is_available(simd)) {
             let mut nan = OperandBuffer::default();
             let left = nan.pack(simd, Format::Bf16, 1, 16, (&[f32::NAN; 16], 16));
-            assert!(unpack(Format::Bf16, left, 1, 16).iter().all(|value| value.is_nan()));
+            assert!(
+                unpack(Format::Bf16, left, 1, 16)
+                    .iter()
+                    .all(|value| value.is_nan())
+            );
         }
     }
 }

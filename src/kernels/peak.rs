@@ -1,7 +1,7 @@
 //! What the machine can do at most, so that a measured time can be given as a share of it.
 //!
-//! Each loop keeps enough independent sums in registers to hide the latency of its instruction and touches no memory;
-//! what it reaches is the most that any kernel made of that instruction can.
+//! Each loop keeps enough independent sums in registers to hide the latency of its instruction and
+//! touches no memory; what it reaches is the most that any kernel made of that instruction can.
 
 use super::Simd;
 #[cfg(target_arch = "x86_64")]
@@ -17,9 +17,14 @@ const SUMS: usize = 12;
 /// Instructions per sum between two looks at the clock.
 const ROUNDS: usize = 20_000;
 
-/// Multiply-adds of f32 per second on this thread, each counted as two operations, over at least `time`.
+/// Multiply-adds of f32 per second on this thread, each counted as two operations, over at least
+/// `time`.
 pub fn f32_operations(simd: Simd, time: Duration) -> f64 {
-    let lanes = if simd.level() >= SimdLevel::Avx512 { 16 } else { 8 };
+    let lanes = if simd.level() >= SimdLevel::Avx512 {
+        16
+    } else {
+        8
+    };
     repeated(time, 2 * lanes, || {
         at_level!(
             simd,
@@ -31,38 +36,52 @@ pub fn f32_operations(simd: Simd, time: Duration) -> f64 {
     })
 }
 
-/// Multiply-adds of bf16 with f32 sums per second on this thread; `None` where the CPU has no such instruction.
+/// Multiply-adds of bf16 with f32 sums per second on this thread; `None` where the CPU has no such
+/// instruction.
 pub fn bf16_operations(simd: Simd, time: Duration) -> Option<f64> {
     #[cfg(target_arch = "x86_64")]
     if simd.level() == SimdLevel::Amx {
-        return Some(repeated(time, tiles::BF16_OPERATIONS, || tiles::repeat_bf16(simd, ROUNDS * SUMS)));
+        return Some(repeated(time, tiles::BF16_OPERATIONS, || {
+            tiles::repeat_bf16(simd, ROUNDS * SUMS)
+        }));
     }
     #[cfg(target_arch = "x86_64")]
     if simd.has_bf16_dot() {
         // SAFETY: `has_bf16_dot` has just told that the CPU has the instruction.
-        return Some(repeated(time, 64, || unsafe { x86::bf16_loop(std::hint::black_box(1)) }));
+        return Some(repeated(time, 64, || unsafe {
+            x86::bf16_loop(std::hint::black_box(1))
+        }));
     }
     let _ = (simd, time);
     None
 }
 
-/// Multiply-adds of int8 with i32 sums per second on this thread; `None` where the CPU has no such instruction.
+/// Multiply-adds of int8 with i32 sums per second on this thread; `None` where the CPU has no such
+/// instruction.
 pub fn int8_operations(simd: Simd, time: Duration) -> Option<f64> {
     #[cfg(target_arch = "x86_64")]
     if simd.level() == SimdLevel::Amx {
-        return Some(repeated(time, tiles::INT8_OPERATIONS, || tiles::repeat_int8(simd, ROUNDS * SUMS)));
+        return Some(repeated(time, tiles::INT8_OPERATIONS, || {
+            tiles::repeat_int8(simd, ROUNDS * SUMS)
+        }));
     }
     #[cfg(target_arch = "x86_64")]
     if simd.level() == SimdLevel::Avx512 {
         // SAFETY: the token proves the level, which includes VNNI.
-        return Some(repeated(time, 128, || unsafe { x86::int8_loop(std::hint::black_box(1)) }));
+        return Some(repeated(time, 128, || unsafe {
+            x86::int8_loop(std::hint::black_box(1))
+        }));
     }
     let _ = (simd, time);
     None
 }
 
 /// Runs `work` (one unit: [`ROUNDS`] x [`SUMS`] instructions) until `time` is over.
-fn repeated(time: Duration, operations_per_instruction: usize, mut work: impl FnMut() -> f32) -> f64 {
+fn repeated(
+    time: Duration,
+    operations_per_instruction: usize,
+    mut work: impl FnMut() -> f32,
+) -> f64 {
     let (started, mut units) = (Instant::now(), 0u64);
     while started.elapsed() < time {
         std::hint::black_box(work());
@@ -118,7 +137,9 @@ mod x86 {
                 *sum = _mm512_dpbusd_epi32(*sum, factor, factor);
             }
         }
-        sums.into_iter().map(|sum| _mm512_reduce_add_epi32(sum) as f32).sum()
+        sums.into_iter()
+            .map(|sum| _mm512_reduce_add_epi32(sum) as f32)
+            .sum()
     }
 }
 
@@ -132,7 +153,10 @@ mod tests {
         for simd in Simd::all() {
             assert!(f32_operations(simd, time) > 0.0);
             assert_eq!(bf16_operations(simd, time).is_some(), simd.has_bf16_dot());
-            assert_eq!(int8_operations(simd, time).is_some(), simd.level() >= SimdLevel::Avx512);
+            assert_eq!(
+                int8_operations(simd, time).is_some(),
+                simd.level() >= SimdLevel::Avx512
+            );
         }
     }
 }

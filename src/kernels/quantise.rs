@@ -1,8 +1,9 @@
 //! f32 vectors to int8 codes, and how much the codes miss.
 //!
-//! Every extracted image passes here (some 300 descriptors of 384 values), and every reference while an index is built.
-//! Written as plain loops over lanes, which the compiler turns into vectors at each level: nothing is fused and sums
-//! have a fixed order, so the bits are the same everywhere. The portable instance is the scalar twin.
+//! Every extracted image passes here (some 300 descriptors of 384 values), and every reference
+//! while an index is built. Written as plain loops over lanes, which the compiler turns into
+//! vectors at each level: nothing is fused and sums have a fixed order, so the bits are the same
+//! everywhere. The portable instance is the scalar twin.
 
 use super::Simd;
 #[cfg(target_arch = "x86_64")]
@@ -43,7 +44,13 @@ pub fn largest(simd: Simd, values: &[f32]) -> f32 {
 
 #[inline(always)]
 fn largest_of(values: &[f32]) -> f32 {
-    let larger = |held: f32, value: f32| if value.abs() > held { value.abs() } else { held };
+    let larger = |held: f32, value: f32| {
+        if value.abs() > held {
+            value.abs()
+        } else {
+            held
+        }
+    };
     let mut lanes = [0f32; LANES];
     let (groups, rest) = values.as_chunks::<LANES>();
     for group in groups {
@@ -51,11 +58,13 @@ fn largest_of(values: &[f32]) -> f32 {
             lanes[lane] = larger(lanes[lane], group[lane]);
         }
     }
-    rest.iter().chain(&lanes).fold(0.0, |held, &value| larger(held, value))
+    rest.iter()
+        .chain(&lanes)
+        .fold(0.0, |held, &value| larger(held, value))
 }
 
-/// Writes `value / divisor * factor` as codes in -127..=127, rounded to the nearest, halves away from zero; what is not
-/// a number becomes 0.
+/// Writes `value / divisor * factor` as codes in -127..=127, rounded to the nearest, halves away
+/// from zero; what is not a number becomes 0.
 ///
 /// # Panics
 /// If `values` and `codes` differ in length.
@@ -68,8 +77,13 @@ pub fn quantise(simd: Simd, values: &[f32], divisor: f32, factor: f32, codes: &m
 fn quantise_all(values: &[f32], divisor: f32, factor: f32, codes: &mut [i8]) {
     for (code, value) in codes.iter_mut().zip(values) {
         let scaled = value / divisor * factor;
-        let scaled = if scaled.is_nan() { 0.0 } else { scaled.clamp(-127.0, 127.0) };
-        // SAFETY: a number within -127..=127. A plain cast would saturate, which the compiler does lane by lane.
+        let scaled = if scaled.is_nan() {
+            0.0
+        } else {
+            scaled.clamp(-127.0, 127.0)
+        };
+        // SAFETY: a number within -127..=127. A plain cast would saturate, which the compiler does
+        // lane by lane.
         let whole: i32 = unsafe { scaled.to_int_unchecked() };
         // Exact, so that a half is told from what lies beside it.
         let left = scaled - whole as f32;
@@ -90,7 +104,9 @@ pub fn squared_lengths(simd: Simd, values: &[f32], codes: &[i8], scale: f32) -> 
 fn sum_squares(values: &[f32], codes: &[i8], scale: f32) -> (f64, f64) {
     let (mut missed, mut whole) = ([0f64; LANES], [0f64; LANES]);
     for (values, codes) in values.chunks(LANES).zip(codes.chunks(LANES)) {
-        if let (Some(values), Some(codes)) = (values.first_chunk::<LANES>(), codes.first_chunk::<LANES>()) {
+        if let (Some(values), Some(codes)) =
+            (values.first_chunk::<LANES>(), codes.first_chunk::<LANES>())
+        {
             for lane in 0..LANES {
                 let value = f64::from(values[lane]);
                 let error = value - f64::from(scale) * f64::from(codes[lane]);
@@ -123,7 +139,10 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
             quantise(simd, &values, divisor, 127.0, &mut found);
             let bits = |(missed, whole): (f64, f64)| (missed.to_bits(), whole.to_bits());
             let finite = values.iter().all(|value| value.is_finite());
-            let sums = [squared_lengths(simd, &values, &found, divisor), sum_squares(&values, &found, divisor)];
+            let sums = [
+                squared_lengths(simd, &values, &found, divisor),
+                sum_squares(&values, &found, divisor),
+            ];
             if found != expected
                 || largest(simd, &values).to_bits() != largest_of(&values).to_bits()
                 || finite && bits(sums[0]) != bits(sums[1])
@@ -142,8 +161,20 @@ mod tests {
 
     #[test]
     fn halves_go_away_from_zero_and_excess_to_the_ends() {
-        let values =
-            [0.5, -0.5, 0.49999997, -0.49999997, 1.5, -2.5, 126.5, 300.0, -300.0, f32::NAN, f32::INFINITY, 0.0];
+        let values = [
+            0.5,
+            -0.5,
+            0.49999997,
+            -0.49999997,
+            1.5,
+            -2.5,
+            126.5,
+            300.0,
+            -300.0,
+            f32::NAN,
+            f32::INFINITY,
+            0.0,
+        ];
         for simd in Simd::all() {
             let mut codes = [0; 12];
             quantise(simd, &values, 1.0, 1.0, &mut codes);

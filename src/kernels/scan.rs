@@ -1,14 +1,16 @@
-//! One int8 vector against many: exact dot products, the bounds on the distance that follow from them, and which rows
-//! come near enough to be looked at. The inner loop of the search.
+//! One int8 vector against many: exact dot products, the bounds on the distance that follow from
+//! them, and which rows come near enough to be looked at. The inner loop of the search.
 //!
-//! A scan of a large map waits for memory, so a row must cost little else: sixteen rows are multiplied, added up across
-//! their registers together, bounded and compared at once. Rows are not prefetched by instruction: the columns are read
-//! straight through, which the CPU foresees by itself, and a prefetch per line made the scan a third slower.
+//! A scan of a large map waits for memory, so a row must cost little else: sixteen rows are
+//! multiplied, added up across their registers together, bounded and compared at once. Rows are not
+//! prefetched by instruction: the columns are read straight through, which the CPU foresees by
+//! itself, and a prefetch per line made the scan a third slower.
 //!
-//! AVX2 has only a product of unsigned with signed bytes that adds neighbours into 16 bits. Codes lie in -127..=127,
-//! so the query's signs are moved to the row (`vpsignb`) and two products reach at most 2 * 127 * 127 = 32,258: never
-//! saturated. VNNI adds four products into 32 bits; there the row is shifted by 128, and 128 times the query's sum, which
-//! is the same for every row, taken off again.
+//! AVX2 has only a product of unsigned with signed bytes that adds neighbours into 16 bits. Codes
+//! lie in -127..=127, so the query's signs are moved to the row (`vpsignb`) and two products reach
+//! at most 2 * 127 * 127 = 32,258: never saturated. VNNI adds four products into 32 bits; there the
+//! row is shifted by 128, and 128 times the query's sum, which is the same for every row, taken off
+//! again.
 
 use super::Simd;
 #[cfg(target_arch = "x86_64")]
@@ -86,7 +88,10 @@ pub struct Bounds {
 
 impl Bounds {
     /// To be overwritten.
-    pub const NONE: Self = Self { lower: [f32::NAN; GROUP], upper: [f32::NAN; GROUP] };
+    pub const NONE: Self = Self {
+        lower: [f32::NAN; GROUP],
+        upper: [f32::NAN; GROUP],
+    };
 }
 
 /// The bounds of one row, from the dot product of its codes with the query's:
@@ -96,13 +101,16 @@ pub fn bounds(probe: &Probe, rows: &Rows<'_>, row: usize, dot: i32) -> (f32, f32
     let squares = probe.square + rows.squares[row];
     let similarity = dot as f32 * (probe.scale * rows.scales[row]);
     let error = probe.length * rows.errors[row] + probe.error * rows.longest;
-    let (middle, half) = (squares - 2.0 * similarity, 2.0 * error + probe.slack * squares);
+    let (middle, half) = (
+        squares - 2.0 * similarity,
+        2.0 * error + probe.slack * squares,
+    );
     (middle - half, middle + half)
 }
 
-/// Looks through whole groups of [`GROUP`] rows from row `from` (a multiple of that) on for one with a lower bound that
-/// does not exceed `threshold` (or is not a number), and tells where it starts and its bounds. Rows beyond the last
-/// whole group are the caller's.
+/// Looks through whole groups of [`GROUP`] rows from row `from` (a multiple of that) on for one
+/// with a lower bound that does not exceed `threshold` (or is not a number), and tells where it
+/// starts and its bounds. Rows beyond the last whole group are the caller's.
 ///
 /// # Panics
 /// If the columns differ in length.
@@ -115,30 +123,47 @@ pub fn next_near(
     found: &mut Bounds,
 ) -> Option<usize> {
     let len = rows.codes.len();
-    assert!(rows.scales.len() == len && rows.errors.len() == len && rows.squares.len() == len, "columns of one length");
+    assert!(
+        rows.scales.len() == len && rows.errors.len() == len && rows.squares.len() == len,
+        "columns of one length"
+    );
     match simd.level() {
         #[cfg(target_arch = "x86_64")]
         // SAFETY: the token proves that the CPU has the level's instructions.
         SimdLevel::Avx2 => unsafe { x86::next_near_avx2(probe, rows, from, threshold, found) },
         #[cfg(target_arch = "x86_64")]
         // SAFETY: as above.
-        SimdLevel::Avx512 | SimdLevel::Amx => unsafe { x86::next_near_avx512(probe, rows, from, threshold, found) },
+        SimdLevel::Avx512 | SimdLevel::Amx => unsafe {
+            x86::next_near_avx512(probe, rows, from, threshold, found)
+        },
         _ => next_near_scalar(probe, rows, from, threshold, found),
     }
 }
 
 /// The definition.
-fn next_near_scalar(probe: &Probe, rows: &Rows<'_>, from: usize, threshold: f32, found: &mut Bounds) -> Option<usize> {
-    (from..rows.codes.len()).step_by(GROUP).take_while(|start| rows.codes.len() - start >= GROUP).find(|&start| {
-        let mut dots = [0; GROUP];
-        scalar(&probe.codes, &rows.codes[start..start + GROUP], &mut dots);
-        is_near(probe, rows, start, &dots, threshold, found)
-    })
+fn next_near_scalar(
+    probe: &Probe,
+    rows: &Rows<'_>,
+    from: usize,
+    threshold: f32,
+    found: &mut Bounds,
+) -> Option<usize> {
+    (from..rows.codes.len())
+        .step_by(GROUP)
+        .take_while(|start| rows.codes.len() - start >= GROUP)
+        .find(|&start| {
+            let mut dots = [0; GROUP];
+            scalar(&probe.codes, &rows.codes[start..start + GROUP], &mut dots);
+            is_near(probe, rows, start, &dots, threshold, found)
+        })
 }
 
 /// Fills `found` with the bounds of the group at `start`; whether one of them may be near.
 #[inline(always)]
-#[expect(clippy::neg_cmp_op_on_partial_ord, reason = "a bound that is not a number keeps its row")]
+#[expect(
+    clippy::neg_cmp_op_on_partial_ord,
+    reason = "a bound that is not a number keeps its row"
+)]
 fn is_near(
     probe: &Probe,
     rows: &Rows<'_>,
@@ -147,9 +172,21 @@ fn is_near(
     threshold: f32,
     found: &mut Bounds,
 ) -> bool {
-    let column = |values: &[f32]| -> [f32; GROUP] { std::array::from_fn(|lane| values[start..start + GROUP][lane]) };
-    let (scales, errors, squares) = (column(rows.scales), column(rows.errors), column(rows.squares));
-    let group = Rows { codes: &[], scales: &scales, errors: &errors, squares: &squares, longest: rows.longest };
+    let column = |values: &[f32]| -> [f32; GROUP] {
+        std::array::from_fn(|lane| values[start..start + GROUP][lane])
+    };
+    let (scales, errors, squares) = (
+        column(rows.scales),
+        column(rows.errors),
+        column(rows.squares),
+    );
+    let group = Rows {
+        codes: &[],
+        scales: &scales,
+        errors: &errors,
+        squares: &squares,
+        longest: rows.longest,
+    };
     let mut near = false;
     // Without a branch, so that it becomes vector code.
     for (lane, &dot) in dots.iter().enumerate() {
@@ -178,7 +215,12 @@ pub fn dot_products(simd: Simd, query: &Codes, rows: &[Codes], dots: &mut [i32])
 
 fn scalar(query: &Codes, rows: &[Codes], dots: &mut [i32]) {
     for (row, dot) in rows.iter().zip(dots) {
-        *dot = query.0.iter().zip(&row.0).map(|(&a, &b)| i32::from(a) * i32::from(b)).sum();
+        *dot = query
+            .0
+            .iter()
+            .zip(&row.0)
+            .map(|(&a, &b)| i32::from(a) * i32::from(b))
+            .sum();
     }
 }
 
@@ -203,7 +245,8 @@ mod x86 {
         for (row, dot) in rest.iter().zip(rest_dots) {
             let mut sum = _mm256_setzero_si256();
             for (part, &magnitude) in magnitude.iter().enumerate() {
-                sum = _mm256_add_epi32(sum, products(magnitude, load(query, part), load(row, part)));
+                sum =
+                    _mm256_add_epi32(sum, products(magnitude, load(query, part), load(row, part)));
             }
             let mut lanes = [0i32; 8];
             // SAFETY: `lanes` is 32 bytes.
@@ -222,9 +265,18 @@ mod x86 {
     ) -> Option<usize> {
         let magnitude = magnitudes(&probe.codes);
         let mut start = from;
-        while let Some(group) = rows.codes.get(start..).and_then(|rest| rest.first_chunk::<GROUP>()) {
+        while let Some(group) = rows
+            .codes
+            .get(start..)
+            .and_then(|rest| rest.first_chunk::<GROUP>())
+        {
             let mut dots = [0; GROUP];
-            for (four, dots) in group.as_chunks::<ROWS>().0.iter().zip(dots.as_chunks_mut::<ROWS>().0) {
+            for (four, dots) in group
+                .as_chunks::<ROWS>()
+                .0
+                .iter()
+                .zip(dots.as_chunks_mut::<ROWS>().0)
+            {
                 *dots = four_avx2(&probe.codes, &magnitude, four);
             }
             if is_near(probe, rows, start, &dots, threshold, found) {
@@ -255,8 +307,14 @@ mod x86 {
                 *sum = _mm256_add_epi32(*sum, products(magnitude, signs, load(row, part)));
             }
         }
-        let pairs = _mm256_hadd_epi32(_mm256_hadd_epi32(sums[0], sums[1]), _mm256_hadd_epi32(sums[2], sums[3]));
-        let four = _mm_add_epi32(_mm256_castsi256_si128(pairs), _mm256_extracti128_si256::<1>(pairs));
+        let pairs = _mm256_hadd_epi32(
+            _mm256_hadd_epi32(sums[0], sums[1]),
+            _mm256_hadd_epi32(sums[2], sums[3]),
+        );
+        let four = _mm_add_epi32(
+            _mm256_castsi256_si128(pairs),
+            _mm256_extracti128_si256::<1>(pairs),
+        );
         let mut dots = [0; ROWS];
         // SAFETY: `dots` is an array of four i32, 16 bytes.
         unsafe { _mm_storeu_si128(dots.as_mut_ptr().cast(), four) };
@@ -293,7 +351,10 @@ mod x86 {
         for (part, codes) in parts.iter_mut().enumerate() {
             *codes = load_wide(query, part);
         }
-        Wide { parts, excess: 128 * query.0.iter().map(|&code| i32::from(code)).sum::<i32>() }
+        Wide {
+            parts,
+            excess: 128 * query.0.iter().map(|&code| i32::from(code)).sum::<i32>(),
+        }
     }
 
     /// Lanes that add up to the dot product and the query's excess.
@@ -304,7 +365,11 @@ mod x86 {
         let shift = _mm512_set1_epi8(i8::MIN);
         let mut sum = _mm512_setzero_si512();
         for part in 0..WIDE_PARTS {
-            sum = _mm512_dpbusd_epi32(sum, _mm512_xor_si512(load_wide(row, part), shift), query.parts[part]);
+            sum = _mm512_dpbusd_epi32(
+                sum,
+                _mm512_xor_si512(load_wide(row, part), shift),
+                query.parts[part],
+            );
         }
         sum
     }
@@ -326,11 +391,16 @@ mod x86 {
         let (fours, _) = rows.as_chunks::<ROWS>();
         let (a, b) = (four_wide(query, &fours[0]), four_wide(query, &fours[1]));
         let (c, d) = (four_wide(query, &fours[2]), four_wide(query, &fours[3]));
-        // Each register has four rows in each of its quarters; quarters are added up, and come out in order of rows.
-        let ab =
-            _mm512_add_epi32(_mm512_shuffle_i32x4::<0b10_00_10_00>(a, b), _mm512_shuffle_i32x4::<0b11_01_11_01>(a, b));
-        let cd =
-            _mm512_add_epi32(_mm512_shuffle_i32x4::<0b10_00_10_00>(c, d), _mm512_shuffle_i32x4::<0b11_01_11_01>(c, d));
+        // Each register has four rows in each of its quarters; quarters are added up, and come out
+        // in order of rows.
+        let ab = _mm512_add_epi32(
+            _mm512_shuffle_i32x4::<0b10_00_10_00>(a, b),
+            _mm512_shuffle_i32x4::<0b11_01_11_01>(a, b),
+        );
+        let cd = _mm512_add_epi32(
+            _mm512_shuffle_i32x4::<0b10_00_10_00>(c, d),
+            _mm512_shuffle_i32x4::<0b11_01_11_01>(c, d),
+        );
         let sums = _mm512_add_epi32(
             _mm512_shuffle_i32x4::<0b10_00_10_00>(ab, cd),
             _mm512_shuffle_i32x4::<0b11_01_11_01>(ab, cd),
@@ -338,7 +408,10 @@ mod x86 {
         let mut dots = [0; GROUP];
         // SAFETY: `dots` is an array of sixteen i32, 64 bytes.
         unsafe {
-            _mm512_storeu_si512(dots.as_mut_ptr().cast(), _mm512_sub_epi32(sums, _mm512_set1_epi32(query.excess)))
+            _mm512_storeu_si512(
+                dots.as_mut_ptr().cast(),
+                _mm512_sub_epi32(sums, _mm512_set1_epi32(query.excess)),
+            )
         };
         dots
     }
@@ -361,7 +434,11 @@ mod x86 {
     ) -> Option<usize> {
         let wide = widened(&probe.codes);
         let mut start = from;
-        while let Some(group) = rows.codes.get(start..).and_then(|rest| rest.first_chunk::<GROUP>()) {
+        while let Some(group) = rows
+            .codes
+            .get(start..)
+            .and_then(|rest| rest.first_chunk::<GROUP>())
+        {
             let dots = sixteen_wide(&wide, group);
             if is_near(probe, rows, start, &dots, threshold, found) {
                 return Some(start);
@@ -384,11 +461,19 @@ mod x86 {
 pub(super) fn check(simd: Simd) -> Result<(), String> {
     let mut state = 0x2545_f491_4f6c_dd1du64;
     let mut code = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
         ((state >> 33) % 255) as i8
     };
-    let extreme = [Codes::new([127; LENGTH]), Codes::new([-127; LENGTH]), Codes::ZERO];
-    let mut rows: Vec<Codes> = (0..14).map(|_| Codes::new(std::array::from_fn(|_| code()))).collect();
+    let extreme = [
+        Codes::new([127; LENGTH]),
+        Codes::new([-127; LENGTH]),
+        Codes::ZERO,
+    ];
+    let mut rows: Vec<Codes> = (0..14)
+        .map(|_| Codes::new(std::array::from_fn(|_| code())))
+        .collect();
     rows.extend(extreme);
     for (number, query) in rows.iter().enumerate() {
         for count in [0, 1, 3, 4, 7, rows.len()] {
@@ -396,7 +481,9 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
             scalar(query, &rows[..count], &mut expected);
             dot_products(simd, query, &rows[..count], &mut found);
             if expected != found {
-                return Err(format!("query {number} with {count} rows: {found:?} is not {expected:?}"));
+                return Err(format!(
+                    "query {number} with {count} rows: {found:?} is not {expected:?}"
+                ));
             }
         }
     }
@@ -406,11 +493,28 @@ pub(super) fn check(simd: Simd) -> Result<(), String> {
 /// Compares which groups are near, and their bounds.
 fn check_near(simd: Simd, codes: &[Codes]) -> Result<(), String> {
     let codes: Vec<Codes> = codes.iter().cycle().take(5 * GROUP + 3).copied().collect();
-    let column = |scale: f32| -> Vec<f32> { (0..codes.len()).map(|row| (row % 7 + 1) as f32 * scale).collect() };
+    let column = |scale: f32| -> Vec<f32> {
+        (0..codes.len())
+            .map(|row| (row % 7 + 1) as f32 * scale)
+            .collect()
+    };
     let (scales, errors, squares) = (column(1e-3), column(1e-2), column(0.5));
-    let rows = Rows { codes: &codes, scales: &scales, errors: &errors, squares: &squares, longest: 3.0 };
+    let rows = Rows {
+        codes: &codes,
+        scales: &scales,
+        errors: &errors,
+        squares: &squares,
+        longest: 3.0,
+    };
     for &codes in &codes[..GROUP] {
-        let probe = Probe { codes, scale: 2e-3, square: 1.5, length: 1.25, error: 0.02, slack: 1e-4 };
+        let probe = Probe {
+            codes,
+            scale: 2e-3,
+            square: 1.5,
+            length: 1.25,
+            error: 0.02,
+            slack: 1e-4,
+        };
         for threshold in [f32::NEG_INFINITY, -20.0, -2.0, 0.5, f32::INFINITY, f32::NAN] {
             let mut from = Some(0);
             while let Some(start) = from {
@@ -435,7 +539,8 @@ mod tests {
     use proptest::prelude::*;
 
     fn codes() -> impl Strategy<Value = Codes> {
-        prop::collection::vec(any::<i8>(), LENGTH).prop_map(|codes| Codes::new(codes.try_into().unwrap()))
+        prop::collection::vec(any::<i8>(), LENGTH)
+            .prop_map(|codes| Codes::new(codes.try_into().unwrap()))
     }
 
     proptest! {

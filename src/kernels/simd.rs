@@ -1,9 +1,10 @@
 //! Which instructions the kernels may use, decided once at start.
 //!
-//! A kernel takes a [`Simd`] and dispatches on its [`level`](Simd::level). The token cannot be made for a level the
-//! CPU lacks, so holding one is the proof that every call into a `#[target_feature]` function of that level needs.
-//! [`selected`] is what the process uses: the highest level of the CPU, or the one `PLACEFORMER_SIMD` forces. Asking
-//! for a level the CPU lacks is an error, never a quiet step down.
+//! A kernel takes a [`Simd`] and dispatches on its [`level`](Simd::level). The token cannot be made
+//! for a level the CPU lacks, so holding one is the proof that every call into a
+//! `#[target_feature]` function of that level needs. [`selected`] is what the process uses: the
+//! highest level of the CPU, or the one `PLACEFORMER_SIMD` forces. Asking for a level the CPU lacks
+//! is an error, never a quiet step down.
 
 #[cfg(target_arch = "x86_64")]
 use super::tiles;
@@ -24,7 +25,8 @@ pub enum SimdLevel {
     Avx2,
     /// AVX-512 F, BW, DQ, VL and VNNI on top of [`SimdLevel::Avx2`].
     Avx512,
-    /// Tiles of bf16 and int8 (AMX), for matrix products, and AVX-512 BF16 on top of [`SimdLevel::Avx512`].
+    /// Tiles of bf16 and int8 (AMX), for matrix products, and AVX-512 BF16 on top of
+    /// [`SimdLevel::Avx512`].
     Amx,
 }
 
@@ -61,7 +63,12 @@ impl SimdLevel {
             Self::Scalar => true,
             Self::Avx2 => avx2(),
             Self::Avx512 => avx2() && avx512(),
-            Self::Amx => avx2() && avx512() && is_x86_feature_detected!("avx512bf16") && tiles::are_available(),
+            Self::Amx => {
+                avx2()
+                    && avx512()
+                    && is_x86_feature_detected!("avx512bf16")
+                    && tiles::are_available()
+            }
         }
     }
 
@@ -84,7 +91,9 @@ impl FromStr for SimdLevel {
         Self::ALL
             .into_iter()
             .find(|level| level.as_str() == text)
-            .ok_or_else(|| SimdError::UnknownLevel { value: text.to_owned() })
+            .ok_or_else(|| SimdError::UnknownLevel {
+                value: text.to_owned(),
+            })
     }
 }
 
@@ -93,7 +102,9 @@ impl FromStr for SimdLevel {
 #[non_exhaustive]
 pub enum SimdError {
     /// The variable holds something else than a level.
-    #[error("{SIMD_VARIABLE}={value:?} is not a SIMD level; use scalar, avx2, avx512 or amx, or leave it unset")]
+    #[error(
+        "{SIMD_VARIABLE}={value:?} is not a SIMD level; use scalar, avx2, avx512 or amx, or leave it unset"
+    )]
     UnknownLevel {
         /// What it holds.
         value: String,
@@ -140,14 +151,19 @@ pub struct Simd {
 
 impl Simd {
     /// The portable level, which every CPU has.
-    pub const SCALAR: Self = Self { level: SimdLevel::Scalar };
+    pub const SCALAR: Self = Self {
+        level: SimdLevel::Scalar,
+    };
 
     /// The token of `level`, if the CPU has it.
     pub fn new(level: SimdLevel) -> Result<Self, SimdError> {
         if level.is_available() {
             Ok(Self { level })
         } else {
-            Err(SimdError::Unavailable { asked: level, best: Self::best().level })
+            Err(SimdError::Unavailable {
+                asked: level,
+                best: Self::best().level,
+            })
         }
     }
 
@@ -158,13 +174,18 @@ impl Simd {
 
     /// Every level of this CPU, ascending: what tests run a kernel at.
     pub fn all() -> impl Iterator<Item = Self> {
-        SimdLevel::ALL.into_iter().filter(|level| level.is_available()).map(|level| Self { level })
+        SimdLevel::ALL
+            .into_iter()
+            .filter(|level| level.is_available())
+            .map(|level| Self { level })
     }
 
     /// The lower of this level and `limit`.
     pub fn at_most(self, limit: SimdLevel) -> Self {
         // Each level includes those before it.
-        Self { level: self.level.min(limit) }
+        Self {
+            level: self.level.min(limit),
+        }
     }
 
     /// The level proven.
@@ -197,15 +218,21 @@ static SELECTED: OnceLock<Result<Simd, SimdError>> = OnceLock::new();
 /// The variable names no level, or one the CPU lacks. Programs call this at start (through
 /// [`self_check`](super::self_check)) and stop on an error.
 pub fn try_selected() -> Result<Simd, SimdError> {
-    let read = || choose(std::env::var_os(SIMD_VARIABLE).map(|value| value.to_string_lossy().into_owned()).as_deref());
+    let read = || {
+        choose(
+            std::env::var_os(SIMD_VARIABLE)
+                .map(|value| value.to_string_lossy().into_owned())
+                .as_deref(),
+        )
+    };
     SELECTED.get_or_init(read).clone()
 }
 
 /// [`try_selected`] for the kernels' callers.
 ///
 /// # Panics
-/// Where `try_selected` fails: going on with other instructions than those asked for would be a silent fallback, and
-/// a program that checked at start never comes here.
+/// Where `try_selected` fails: going on with other instructions than those asked for would be a
+/// silent fallback, and a program that checked at start never comes here.
 pub fn selected() -> Simd {
     match try_selected() {
         Ok(simd) => simd,
@@ -226,7 +253,13 @@ mod tests {
             if available.contains(&level) {
                 assert_eq!(chosen, Ok(level));
             } else {
-                assert_eq!(chosen, Err(SimdError::Unavailable { asked: level, best: Simd::best().level() }));
+                assert_eq!(
+                    chosen,
+                    Err(SimdError::Unavailable {
+                        asked: level,
+                        best: Simd::best().level()
+                    })
+                );
             }
         }
     }
@@ -236,6 +269,9 @@ mod tests {
         assert_eq!(choose(None), Ok(Simd::best()));
         assert_eq!(choose(Some("  ")), Ok(Simd::best()));
         let message = choose(Some("sse9")).unwrap_err().to_string();
-        assert!(message.contains("sse9") && message.contains("avx2"), "{message}");
+        assert!(
+            message.contains("sse9") && message.contains("avx2"),
+            "{message}"
+        );
     }
 }

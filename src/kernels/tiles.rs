@@ -1,8 +1,9 @@
 //! Products in matrix registers (Intel AMX): eight of them, each sixteen rows of 64 bytes.
 //!
-//! The stable compiler has no intrinsics for them, but its assembler knows the instructions. No compiled code touches
-//! these registers, so they keep what they hold from one `asm!` block to the next; a thread drops what it left there when
-//! it has no more products to compute, so that the system need not save it.
+//! The stable compiler has no intrinsics for them, but its assembler knows the instructions. No
+//! compiled code touches these registers, so they keep what they hold from one `asm!` block to the
+//! next; a thread drops what it left there when it has no more products to compute, so that the
+//! system need not save it.
 
 use super::Simd;
 use super::gemm::TileJob;
@@ -49,7 +50,8 @@ fn extended_state() -> u64 {
     unsafe { _xgetbv(0) }
 }
 
-/// Linux hands the state of tiles out on request only, to the whole process (its `Documentation/arch/x86/xstate.rst`).
+/// Linux hands the state of tiles out on request only, to the whole process (its
+/// `Documentation/arch/x86/xstate.rst`).
 #[cfg(target_os = "linux")]
 fn request_permission() -> bool {
     const ARCH_REQ_XCOMP_PERM: libc::c_long = 0x1023;
@@ -87,8 +89,9 @@ thread_local! {
     static HOLDERS: Cell<usize> = const { Cell::new(0) };
 }
 
-/// This thread's registers, configured to their full size until the last of these is dropped. Configuring and
-/// releasing them takes as long as half a product of 32 rows, so whoever multiplies many panels holds one meanwhile.
+/// This thread's registers, configured to their full size until the last of these is dropped.
+/// Configuring and releasing them takes as long as half a product of 32 rows, so whoever multiplies
+/// many panels holds one meanwhile.
 pub(super) struct Registers {
     /// They are the thread's own: this must not go to another.
     _thread: PhantomData<*const ()>,
@@ -96,31 +99,42 @@ pub(super) struct Registers {
 
 impl Registers {
     pub(super) fn take(simd: Simd) -> Self {
-        assert!(simd.level() == SimdLevel::Amx, "level {} has no tiles", simd.level());
+        assert!(
+            simd.level() == SimdLevel::Amx,
+            "level {} has no tiles",
+            simd.level()
+        );
         if HOLDERS.replace(HOLDERS.get() + 1) == 0 {
-            // SAFETY: the token proves that the CPU has tiles and the system lets them be used; FULL is 64 bytes.
-            unsafe { asm!("ldtilecfg [{}]", in(reg) &raw const FULL, options(nostack, preserves_flags, readonly)) };
+            // SAFETY: the token proves that the CPU has tiles and the system lets them be used;
+            // FULL is 64 bytes.
+            unsafe {
+                asm!("ldtilecfg [{}]", in(reg) &raw const FULL, options(nostack, preserves_flags, readonly))
+            };
         }
-        Self { _thread: PhantomData }
+        Self {
+            _thread: PhantomData,
+        }
     }
 }
 
 impl Drop for Registers {
     fn drop(&mut self) {
         if HOLDERS.replace(HOLDERS.get() - 1) == 1 {
-            // SAFETY: a `Registers` exists only where there are tiles; nobody else on this thread has one.
+            // SAFETY: a `Registers` exists only where there are tiles; nobody else on this thread
+            // has one.
             unsafe { asm!("tilerelease", options(nostack, preserves_flags, nomem)) };
         }
     }
 }
 
-/// The loops over rows and segments, and the loop over a segment, for one instruction. Tiles 0 to 3 hold the sums (two
-/// below each other by two beside each other), 4 and 5 rows of the left, 6 and 7 of the right.
+/// The loops over rows and segments, and the loop over a segment, for one instruction. Tiles 0 to 3
+/// hold the sums (two below each other by two beside each other), 4 and 5 rows of the left, 6 and 7
+/// of the right.
 macro_rules! product {
     ($name:ident, $dot:literal) => {
         /// # Safety
-        /// There are tiles, configured to their full size; extents are those that the fields tell, `rows` and `k` are
-        /// whole tiles and steps, and so is `segment_rows` unless it covers `k`.
+        /// There are tiles, configured to their full size; extents are those that the fields tell,
+        /// `rows` and `k` are whole tiles and steps, and so is `segment_rows` unless it covers `k`.
         unsafe fn $name(job: &TileJob) {
             let mut row = 0;
             while row < job.rows {
@@ -135,8 +149,8 @@ macro_rules! product {
                 }
                 while remaining > 0 {
                     let count = remaining.min(job.segment_rows);
-                    // SAFETY: reads `count` words of each of the rows and as many lines of the panel, which the caller
-                    // vouches for; strides are in bytes.
+                    // SAFETY: reads `count` words of each of the rows and as many lines of the
+                    // panel, which the caller vouches for; strides are in bytes.
                     unsafe {
                         if pair {
                             asm!(
@@ -218,8 +232,8 @@ product!(int8_product, "tdpbusd");
 /// The whole of a product.
 ///
 /// # Safety
-/// The job's pointers are valid for what its fields tell; `rows` are whole registers, the panel is two registers wide,
-/// `k` is whole steps, and so is `segment_rows` unless it covers `k`.
+/// The job's pointers are valid for what its fields tell; `rows` are whole registers, the panel is
+/// two registers wide, `k` is whole steps, and so is `segment_rows` unless it covers `k`.
 pub(super) unsafe fn multiply(simd: Simd, format: Format, job: &TileJob) {
     let _registers = Registers::take(simd);
     // SAFETY: the caller's; the registers are configured.

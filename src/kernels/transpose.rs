@@ -25,9 +25,16 @@ pub(super) fn transpose(
     if rows == 0 || columns == 0 {
         return;
     }
-    assert!(covers(source.len(), rows, stride, columns), "source too short");
-    assert!(covers(out.len(), columns, out_stride, rows), "result too short");
-    let (whole_rows, whole_columns) = transpose_squares(simd, (source, stride), (rows, columns), out, out_stride);
+    assert!(
+        covers(source.len(), rows, stride, columns),
+        "source too short"
+    );
+    assert!(
+        covers(out.len(), columns, out_stride, rows),
+        "result too short"
+    );
+    let (whole_rows, whole_columns) =
+        transpose_squares(simd, (source, stride), (rows, columns), out, out_stride);
     for row in 0..rows {
         let first = if row < whole_rows { whole_columns } else { 0 };
         for column in first..columns {
@@ -49,8 +56,12 @@ fn transpose_squares(
         let (rows, columns) = (rows / SIDE * SIDE, columns / SIDE * SIDE);
         for row in (0..rows).step_by(SIDE) {
             for column in (0..columns).step_by(SIDE) {
-                let (from, to) = (&source[row * stride + column..], &mut out[column * out_stride + row..]);
-                // SAFETY: the token proves the level; the square lies inside what `transpose` has checked.
+                let (from, to) = (
+                    &source[row * stride + column..],
+                    &mut out[column * out_stride + row..],
+                );
+                // SAFETY: the token proves the level; the square lies inside what `transpose` has
+                // checked.
                 unsafe { transpose_square(from.as_ptr(), stride, to.as_mut_ptr(), out_stride) };
             }
         }
@@ -60,8 +71,8 @@ fn transpose_squares(
     (0, 0)
 }
 
-/// Which lanes of two rows, `distance` apart, the upper and the lower of them take: each keeps its half of every block
-/// of twice that width and gets the other's.
+/// Which lanes of two rows, `distance` apart, the upper and the lower of them take: each keeps its
+/// half of every block of twice that width and gets the other's.
 #[cfg(target_arch = "x86_64")]
 const fn exchange(distance: usize, lower: bool) -> [u32; SIDE] {
     let mut lanes = [0; SIDE];
@@ -94,7 +105,8 @@ unsafe fn transpose_square(source: *const u32, stride: usize, out: *mut u32, out
     ];
     // SAFETY: the caller's; the tables are as long as a vector.
     unsafe {
-        let mut rows: [__m512i; SIDE] = std::array::from_fn(|row| _mm512_loadu_si512(source.add(row * stride).cast()));
+        let mut rows: [__m512i; SIDE] =
+            std::array::from_fn(|row| _mm512_loadu_si512(source.add(row * stride).cast()));
         for (round, lanes) in EXCHANGES.iter().enumerate() {
             let distance = 8 >> round;
             let [of_upper, of_lower] = lanes.map(|lanes| _mm512_loadu_si512(lanes.as_ptr().cast()));

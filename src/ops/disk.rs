@@ -15,7 +15,10 @@ pub struct DiskSpace {
 /// Asks the file system that holds `path`.
 pub fn space(path: &Path) -> io::Result<DiskSpace> {
     let stat = rustix::fs::statvfs(path)?;
-    Ok(DiskSpace { free: stat.f_bavail * stat.f_frsize, total: stat.f_blocks * stat.f_frsize })
+    Ok(DiskSpace {
+        free: stat.f_bavail * stat.f_frsize,
+        total: stat.f_blocks * stat.f_frsize,
+    })
 }
 
 impl DiskSpace {
@@ -31,10 +34,22 @@ mod tests {
 
     #[test]
     fn the_reserve_shrinks_on_small_disks() {
-        let small = DiskSpace { free: 1 << 20, total: 10 << 20 };
+        let small = DiskSpace {
+            free: 1 << 20,
+            total: 10 << 20,
+        };
         assert!(!small.is_short_of(64 << 20));
-        assert!(DiskSpace { free: 400 << 10, ..small }.is_short_of(64 << 20));
-        let large = DiskSpace { free: 60 << 20, total: 1 << 40 };
+        assert!(
+            DiskSpace {
+                free: 400 << 10,
+                ..small
+            }
+            .is_short_of(64 << 20)
+        );
+        let large = DiskSpace {
+            free: 60 << 20,
+            total: 1 << 40,
+        };
         assert!(large.is_short_of(64 << 20));
     }
 

@@ -1,8 +1,8 @@
 //! Whether the server is ready, and if not, why.
 //!
-//! One [`Health`] is shared by everything. Start-up moves it forward phase by phase, shutdown turns it to draining,
-//! and a full disk holds it back while it lasts. `/readyz` prints the first reason found; `/readyz?for=query` leaves the
-//! disk out.
+//! One [`Health`] is shared by everything. Start-up moves it forward phase by phase, shutdown turns
+//! it to draining, and a full disk holds it back while it lasts. `/readyz` prints the first reason
+//! found; `/readyz?for=query` leaves the disk out.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -120,15 +120,21 @@ impl Health {
 
     /// The reason for not being ready; `None` when ready.
     pub fn unready(&self) -> Option<Unready> {
-        self.unready_for_queries().or_else(|| self.is_disk_full().then_some(Unready::DiskFull))
+        self.unready_for_queries()
+            .or_else(|| self.is_disk_full().then_some(Unready::DiskFull))
     }
 
-    /// The reason for not answering queries, which a full disk is not; `None` when they are answered.
+    /// The reason for not answering queries, which a full disk is not; `None` when they are
+    /// answered.
     pub fn unready_for_queries(&self) -> Option<Unready> {
         if self.is_draining() {
             return Some(Unready::Draining);
         }
-        match *self.phase.lock().unwrap_or_else(std::sync::PoisonError::into_inner) {
+        match *self
+            .phase
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
+        {
             Phase::LoadingModel => Some(Unready::LoadingModel),
             Phase::Migrating => Some(Unready::Migrating),
             Phase::BuildingIndex => Some(Unready::BuildingIndex {
@@ -140,7 +146,10 @@ impl Health {
     }
 
     fn enter(&self, phase: Phase) {
-        *self.phase.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = phase;
+        *self
+            .phase
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner) = phase;
         tracing::debug!(?phase, "start-up");
     }
 }
@@ -157,7 +166,10 @@ mod tests {
         assert_eq!(health.unready(), Some(Unready::Migrating));
         health.building_index(10);
         health.indexed(4);
-        assert_eq!(health.unready(), Some(Unready::BuildingIndex { done: 4, total: 10 }));
+        assert_eq!(
+            health.unready(),
+            Some(Unready::BuildingIndex { done: 4, total: 10 })
+        );
         health.serving();
         assert_eq!(health.unready(), None);
         health.set_disk_full(true);

@@ -29,7 +29,10 @@ pub struct LogConfig {
 
 impl Default for LogConfig {
     fn default() -> Self {
-        Self { format: LogFormat::Human, filter: "info".into() }
+        Self {
+            format: LogFormat::Human,
+            filter: "info".into(),
+        }
     }
 }
 
@@ -48,13 +51,15 @@ impl LogConfig {
     }
 
     fn directives(&self) -> Result<EnvFilter, InvalidFilter> {
-        EnvFilter::try_new(&self.filter)
-            .map_err(|error| InvalidFilter { filter: self.filter.clone(), reason: error.to_string() })
+        EnvFilter::try_new(&self.filter).map_err(|error| InvalidFilter {
+            filter: self.filter.clone(),
+            reason: error.to_string(),
+        })
     }
 }
 
-/// Sends all events, and the text of panics, to standard error from now on. A second call keeps the first one's
-/// settings.
+/// Sends all events, and the text of panics, to standard error from now on. A second call keeps the
+/// first one's settings.
 pub fn init(config: &LogConfig) -> Result<(), InvalidFilter> {
     let lines = tracing_subscriber::fmt()
         .with_env_filter(config.directives()?)
@@ -62,7 +67,12 @@ pub fn init(config: &LogConfig) -> Result<(), InvalidFilter> {
         .with_writer(std::io::stderr);
     let outcome = match config.format {
         LogFormat::Human => lines.try_init(),
-        LogFormat::Json => lines.json().flatten_event(true).with_current_span(true).with_span_list(false).try_init(),
+        LogFormat::Json => lines
+            .json()
+            .flatten_event(true)
+            .with_current_span(true)
+            .with_span_list(false)
+            .try_init(),
     };
     match outcome {
         Ok(()) => std::panic::set_hook(Box::new(log_panic)),
@@ -71,12 +81,19 @@ pub fn init(config: &LogConfig) -> Result<(), InvalidFilter> {
     Ok(())
 }
 
-/// A panic is an event like any other: one line, in the format of the others, with the request it happened in.
+/// A panic is an event like any other: one line, in the format of the others, with the request it
+/// happened in.
 fn log_panic(panic: &PanicHookInfo<'_>) {
     let backtrace = Backtrace::capture();
-    let backtrace = (backtrace.status() == BacktraceStatus::Captured).then(|| backtrace.to_string());
+    let backtrace =
+        (backtrace.status() == BacktraceStatus::Captured).then(|| backtrace.to_string());
     let location = panic.location().map(ToString::to_string);
-    tracing::error!(panic = panic.payload_as_str().unwrap_or("no text"), location, backtrace, "a thread panicked");
+    tracing::error!(
+        panic = panic.payload_as_str().unwrap_or("no text"),
+        location,
+        backtrace,
+        "a thread panicked"
+    );
 }
 
 #[cfg(test)]
@@ -85,8 +102,17 @@ mod tests {
 
     #[test]
     fn a_wrong_filter_is_named() {
-        let config = LogConfig { filter: "placeformer=loud".into(), ..Default::default() };
-        assert!(config.check().unwrap_err().to_string().contains("placeformer=loud"));
+        let config = LogConfig {
+            filter: "placeformer=loud".into(),
+            ..Default::default()
+        };
+        assert!(
+            config
+                .check()
+                .unwrap_err()
+                .to_string()
+                .contains("placeformer=loud")
+        );
         assert!(LogConfig::default().check().is_ok());
     }
 }

@@ -9,12 +9,18 @@ pub fn resident_bytes() -> Option<u64> {
     kib_field(&fs::read_to_string("/proc/self/status").ok()?, "VmRSS:")
 }
 
-/// Bytes this process may use: the control group's limit if there is one, else the machine's memory.
+/// Bytes this process may use: the control group's limit if there is one, else the machine's
+/// memory.
 pub fn limit_bytes() -> Option<u64> {
-    let machine = fs::read_to_string("/proc/meminfo").ok().and_then(|text| kib_field(&text, "MemTotal:"));
-    let group = ["/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"]
-        .iter()
-        .find_map(|path| fs::read_to_string(path).ok()?.trim().parse().ok());
+    let machine = fs::read_to_string("/proc/meminfo")
+        .ok()
+        .and_then(|text| kib_field(&text, "MemTotal:"));
+    let group = [
+        "/sys/fs/cgroup/memory.max",
+        "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+    ]
+    .iter()
+    .find_map(|path| fs::read_to_string(path).ok()?.trim().parse().ok());
     match (machine, group) {
         (Some(machine), Some(group)) => Some(u64::min(machine, group)),
         (machine, group) => machine.or(group),
@@ -23,7 +29,12 @@ pub fn limit_bytes() -> Option<u64> {
 
 fn kib_field(text: &str, name: &str) -> Option<u64> {
     let line = text.lines().find_map(|line| line.strip_prefix(name))?;
-    line.trim().trim_end_matches("kB").trim().parse::<u64>().ok().map(|kib| kib * 1024)
+    line.trim()
+        .trim_end_matches("kB")
+        .trim()
+        .parse::<u64>()
+        .ok()
+        .map(|kib| kib * 1024)
 }
 
 /// Says whether memory is short; reads the kernel's figure at most four times a second.
@@ -48,21 +59,36 @@ impl MemoryWatermark {
 
     /// A bound in bytes; 0 means 85% of what the process may use.
     pub fn new(bytes: u64) -> Self {
-        let watermark = if bytes == 0 { limit_bytes().map(|limit| limit / 100 * 85) } else { Some(bytes) };
-        Self { watermark, last: Mutex::new(None) }
+        let watermark = if bytes == 0 {
+            limit_bytes().map(|limit| limit / 100 * 85)
+        } else {
+            Some(bytes)
+        };
+        Self {
+            watermark,
+            last: Mutex::new(None),
+        }
     }
 
     /// Fails while the process holds more than the bound.
     pub fn check(&self) -> Result<(), MemoryShort> {
-        let Some(watermark) = self.watermark else { return Ok(()) };
+        let Some(watermark) = self.watermark else {
+            return Ok(());
+        };
         match self.resident() {
-            Some(resident) if resident > watermark => Err(MemoryShort { resident, watermark }),
+            Some(resident) if resident > watermark => Err(MemoryShort {
+                resident,
+                watermark,
+            }),
             _ => Ok(()),
         }
     }
 
     fn resident(&self) -> Option<u64> {
-        let mut last = self.last.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let mut last = self
+            .last
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner);
         if let Some((read, bytes)) = *last
             && read.elapsed() < Self::READ_EVERY
         {
@@ -80,7 +106,10 @@ mod tests {
 
     #[test]
     fn fields_are_read_in_kib() {
-        assert_eq!(kib_field("Name:\tx\nVmRSS:\t  12 kB\n", "VmRSS:"), Some(12 * 1024));
+        assert_eq!(
+            kib_field("Name:\tx\nVmRSS:\t  12 kB\n", "VmRSS:"),
+            Some(12 * 1024)
+        );
         assert_eq!(kib_field("Name:\tx\n", "VmRSS:"), None);
     }
 

@@ -1,11 +1,12 @@
 //! Everything the service measures, in Prometheus' terms.
 //!
-//! Every series is registered and set to zero at start, so that an alert on a rate works from the first minute.
-//! Labels are bounded: routes are matched paths, maps beyond the first fifty fold into `other`.
+//! Every series is registered and set to zero at start, so that an alert on a rate works from the
+//! first minute. Labels are bounded: routes are matched paths, maps beyond the first fifty fold
+//! into `other`.
 
 use prometheus::{
-    Encoder, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry,
-    TextEncoder,
+    Encoder, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge,
+    IntGaugeVec, Opts, Registry, TextEncoder,
 };
 use std::time::Duration;
 
@@ -30,8 +31,15 @@ pub enum Stage {
 
 impl Stage {
     /// All stages in the order of the data.
-    pub const ALL: [Self; 7] =
-        [Self::Decode, Self::Queue, Self::Extract, Self::Search, Self::Load, Self::Rerank, Self::Commit];
+    pub const ALL: [Self; 7] = [
+        Self::Decode,
+        Self::Queue,
+        Self::Extract,
+        Self::Search,
+        Self::Load,
+        Self::Rerank,
+        Self::Commit,
+    ];
 
     /// Its label.
     pub fn as_str(self) -> &'static str {
@@ -131,13 +139,27 @@ impl MemoryComponent {
 }
 
 /// Upper bounds in seconds, 1 ms to 10 s.
-const SECONDS: [f64; 16] =
-    [0.001, 0.002, 0.004, 0.008, 0.015, 0.025, 0.04, 0.06, 0.1, 0.2, 0.4, 0.8, 1.5, 3.0, 6.0, 10.0];
+const SECONDS: [f64; 16] = [
+    0.001, 0.002, 0.004, 0.008, 0.015, 0.025, 0.04, 0.06, 0.1, 0.2, 0.4, 0.8, 1.5, 3.0, 6.0, 10.0,
+];
 /// Upper bounds of S.
-const SCORES: [f64; 14] = [0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0, 500.0, 800.0];
+const SCORES: [f64; 14] = [
+    0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0, 500.0, 800.0,
+];
 /// Upper bounds in bytes, 1 KiB to 1 MiB.
-const BYTES: [f64; 11] =
-    [1024.0, 2048.0, 4096.0, 8192.0, 16384.0, 32768.0, 65536.0, 131_072.0, 262_144.0, 524_288.0, 1_048_576.0];
+const BYTES: [f64; 11] = [
+    1024.0,
+    2048.0,
+    4096.0,
+    8192.0,
+    16384.0,
+    32768.0,
+    65536.0,
+    131_072.0,
+    262_144.0,
+    524_288.0,
+    1_048_576.0,
+];
 /// Maps with a series of their own.
 const MAPS_SHOWN: usize = 50;
 
@@ -164,31 +186,73 @@ pub struct Metrics {
 impl Metrics {
     /// Registers every series. Fails only if two share a name.
     pub fn new() -> Result<Self, prometheus::Error> {
-        let counter = |name: &str, help: &str, labels: &[&str]| IntCounterVec::new(Opts::new(full(name), help), labels);
-        let gauge = |name: &str, help: &str, labels: &[&str]| IntGaugeVec::new(Opts::new(full(name), help), labels);
+        let counter = |name: &str, help: &str, labels: &[&str]| {
+            IntCounterVec::new(Opts::new(full(name), help), labels)
+        };
+        let gauge = |name: &str, help: &str, labels: &[&str]| {
+            IntGaugeVec::new(Opts::new(full(name), help), labels)
+        };
         let metrics = Self {
             registry: Registry::new(),
-            requests: counter("http_requests_total", "Requests answered.", &["route", "method", "status"])?,
-            request_seconds: histogram("http_request_duration_seconds", "Time to an answer.", &["route"], &SECONDS)?,
-            stage_seconds: histogram("stage_duration_seconds", "Time in a stage.", &["stage"], &SECONDS)?,
+            requests: counter(
+                "http_requests_total",
+                "Requests answered.",
+                &["route", "method", "status"],
+            )?,
+            request_seconds: histogram(
+                "http_request_duration_seconds",
+                "Time to an answer.",
+                &["route"],
+                &SECONDS,
+            )?,
+            stage_seconds: histogram(
+                "stage_duration_seconds",
+                "Time in a stage.",
+                &["stage"],
+                &SECONDS,
+            )?,
             queue_depth: IntGauge::new(full("queue_depth"), "Requests waiting for or in compute.")?,
             rejected: counter("rejected_total", "Work turned away.", &["reason"])?,
             references: gauge("references", "References that can be found.", &["map"])?,
-            descriptor_bytes: histogram("descriptor_bytes", "Size of a stored descriptor.", &["kind"], &BYTES)?,
+            descriptor_bytes: histogram(
+                "descriptor_bytes",
+                "Size of a stored descriptor.",
+                &["kind"],
+                &BYTES,
+            )?,
             memory_bytes: gauge("memory_bytes", "Memory by component.", &["component"])?,
             top1_score: Histogram::with_opts(
-                HistogramOpts::new(full("query_top1_score"), "S of the best answer after re-ranking.")
-                    .buckets(SCORES.to_vec()),
+                HistogramOpts::new(
+                    full("query_top1_score"),
+                    "S of the best answer after re-ranking.",
+                )
+                .buckets(SCORES.to_vec()),
             )?,
-            unmatched: IntCounter::new(full("query_unmatched_total"), "Queries whose best answer is not trusted.")?,
+            unmatched: IntCounter::new(
+                full("query_unmatched_total"),
+                "Queries whose best answer is not trusted.",
+            )?,
             corrupt_records: IntCounter::new(
                 full("corrupt_records_total"),
                 "Damaged records met, at start or by any request.",
             )?,
-            quarantined: IntGauge::new(full("quarantined_references"), "Damaged references set aside, not served.")?,
-            ready: IntGauge::new(full("ready"), "1 if queries are answered (/readyz?for=query), else 0.")?,
-            disk_free_bytes: IntGauge::new(full("disk_free_bytes"), "Free bytes on the store's disk.")?,
-            cache_lookups: counter("patch_cache_lookups_total", "Key patches asked of the cache.", &["result"])?,
+            quarantined: IntGauge::new(
+                full("quarantined_references"),
+                "Damaged references set aside, not served.",
+            )?,
+            ready: IntGauge::new(
+                full("ready"),
+                "1 if queries are answered (/readyz?for=query), else 0.",
+            )?,
+            disk_free_bytes: IntGauge::new(
+                full("disk_free_bytes"),
+                "Free bytes on the store's disk.",
+            )?,
+            cache_lookups: counter(
+                "patch_cache_lookups_total",
+                "Key patches asked of the cache.",
+                &["result"],
+            )?,
         };
         metrics.register()?;
         metrics.start_at_zero();
@@ -200,21 +264,30 @@ impl Metrics {
         build.with_label_values(&[env!("CARGO_PKG_VERSION")]).set(1);
         self.registry.register(Box::new(build))?;
         self.registry.register(Box::new(self.requests.clone()))?;
-        self.registry.register(Box::new(self.request_seconds.clone()))?;
-        self.registry.register(Box::new(self.stage_seconds.clone()))?;
+        self.registry
+            .register(Box::new(self.request_seconds.clone()))?;
+        self.registry
+            .register(Box::new(self.stage_seconds.clone()))?;
         self.registry.register(Box::new(self.queue_depth.clone()))?;
         self.registry.register(Box::new(self.rejected.clone()))?;
         self.registry.register(Box::new(self.references.clone()))?;
-        self.registry.register(Box::new(self.descriptor_bytes.clone()))?;
-        self.registry.register(Box::new(self.memory_bytes.clone()))?;
+        self.registry
+            .register(Box::new(self.descriptor_bytes.clone()))?;
+        self.registry
+            .register(Box::new(self.memory_bytes.clone()))?;
         self.registry.register(Box::new(self.top1_score.clone()))?;
         self.registry.register(Box::new(self.unmatched.clone()))?;
-        self.registry.register(Box::new(self.corrupt_records.clone()))?;
+        self.registry
+            .register(Box::new(self.corrupt_records.clone()))?;
         self.registry.register(Box::new(self.quarantined.clone()))?;
         self.registry.register(Box::new(self.ready.clone()))?;
-        self.registry.register(Box::new(self.disk_free_bytes.clone()))?;
-        self.registry.register(Box::new(self.cache_lookups.clone()))?;
-        self.registry.register(Box::new(prometheus::process_collector::ProcessCollector::for_self()))
+        self.registry
+            .register(Box::new(self.disk_free_bytes.clone()))?;
+        self.registry
+            .register(Box::new(self.cache_lookups.clone()))?;
+        self.registry.register(Box::new(
+            prometheus::process_collector::ProcessCollector::for_self(),
+        ))
     }
 
     fn start_at_zero(&self) {
@@ -240,19 +313,26 @@ impl Metrics {
     pub fn expect_route(&self, route: &str, method: &str, statuses: impl IntoIterator<Item = u16>) {
         self.request_seconds.with_label_values(&[route]);
         for status in statuses {
-            self.requests.with_label_values(&[route, method, &status.to_string()]);
+            self.requests
+                .with_label_values(&[route, method, &status.to_string()]);
         }
     }
 
     /// One request was answered.
     pub fn request(&self, route: &str, method: &str, status: u16, took: Duration) {
-        self.requests.with_label_values(&[route, method, &status.to_string()]).inc();
-        self.request_seconds.with_label_values(&[route]).observe(took.as_secs_f64());
+        self.requests
+            .with_label_values(&[route, method, &status.to_string()])
+            .inc();
+        self.request_seconds
+            .with_label_values(&[route])
+            .observe(took.as_secs_f64());
     }
 
     /// A stage took this long.
     pub fn stage(&self, stage: Stage, took: Duration) {
-        self.stage_seconds.with_label_values(&[stage.as_str()]).observe(took.as_secs_f64());
+        self.stage_seconds
+            .with_label_values(&[stage.as_str()])
+            .observe(took.as_secs_f64());
     }
 
     /// Work was turned away.
@@ -272,12 +352,16 @@ impl Metrics {
 
     /// A reference was stored with descriptors of these sizes in bytes.
     pub fn stored_descriptor(&self, global: usize, patches: usize) {
-        self.descriptor_bytes.with_label_values(&["global"]).observe(global as f64);
-        self.descriptor_bytes.with_label_values(&["patches"]).observe(patches as f64);
+        self.descriptor_bytes
+            .with_label_values(&["global"])
+            .observe(global as f64);
+        self.descriptor_bytes
+            .with_label_values(&["patches"])
+            .observe(patches as f64);
     }
 
-    /// A query's best S (0 without any answer, `None` if it was not re-ranked), and whether that answer is trusted
-    /// (`None` if nobody can say).
+    /// A query's best S (0 without any answer, `None` if it was not re-ranked), and whether that
+    /// answer is trusted (`None` if nobody can say).
     pub fn query_answered(&self, top1_score: Option<u32>, matched: Option<bool>) {
         if let Some(score) = top1_score {
             self.top1_score.observe(f64::from(score));
@@ -304,17 +388,22 @@ impl Metrics {
 
     /// Free bytes on the disk that holds the store.
     pub fn set_disk_free(&self, bytes: u64) {
-        self.disk_free_bytes.set(i64::try_from(bytes).unwrap_or(i64::MAX));
+        self.disk_free_bytes
+            .set(i64::try_from(bytes).unwrap_or(i64::MAX));
     }
 
     /// The patch cache was asked.
     pub fn cache_lookup(&self, hit: bool) {
-        self.cache_lookups.with_label_values(&[if hit { "hit" } else { "miss" }]).inc();
+        self.cache_lookups
+            .with_label_values(&[if hit { "hit" } else { "miss" }])
+            .inc();
     }
 
     /// Memory of a component in bytes.
     pub fn set_memory(&self, component: MemoryComponent, bytes: u64) {
-        self.memory_bytes.with_label_values(&[component.as_str()]).set(bytes as i64);
+        self.memory_bytes
+            .with_label_values(&[component.as_str()])
+            .set(bytes as i64);
     }
 
     /// References per map; the largest [`MAPS_SHOWN`] keep their name.
@@ -326,7 +415,9 @@ impl Metrics {
             self.references.with_label_values(&[map]).set(*count as i64);
         }
         let other: u64 = rest.iter().map(|(_, count)| count).sum();
-        self.references.with_label_values(&["other"]).add(other as i64);
+        self.references
+            .with_label_values(&["other"])
+            .add(other as i64);
     }
 
     /// The exposition text.
@@ -344,8 +435,16 @@ fn full(name: &str) -> String {
     format!("placeformer_{name}")
 }
 
-fn histogram(name: &str, help: &str, labels: &[&str], bounds: &[f64]) -> Result<HistogramVec, prometheus::Error> {
-    HistogramVec::new(HistogramOpts::new(full(name), help).buckets(bounds.to_vec()), labels)
+fn histogram(
+    name: &str,
+    help: &str,
+    labels: &[&str],
+    bounds: &[f64],
+) -> Result<HistogramVec, prometheus::Error> {
+    HistogramVec::new(
+        HistogramOpts::new(full(name), help).buckets(bounds.to_vec()),
+        labels,
+    )
 }
 
 #[cfg(test)]
@@ -375,7 +474,12 @@ mod tests {
         let metrics = Metrics::new().unwrap();
         metrics.set_references((0..60).map(|i| (format!("map{i:02}"), 100 - i)).collect());
         let text = metrics.render().unwrap();
-        assert_eq!(text.lines().filter(|line| line.starts_with("placeformer_references{")).count(), 51);
+        assert_eq!(
+            text.lines()
+                .filter(|line| line.starts_with("placeformer_references{"))
+                .count(),
+            51
+        );
         let folded: u64 = (50..60).map(|i| 100 - i).sum();
         assert!(text.contains(&format!("placeformer_references{{map=\"other\"}} {folded}")));
     }

@@ -1,7 +1,7 @@
 //! What operators see and touch: metrics, logs, health, memory, shutdown.
 //!
-//! Nothing here knows the web or the stages; `pipeline` and `http` write into [`Metrics`] and [`Health`], the HTTP
-//! surface reads them out.
+//! Nothing here knows the web or the stages; `pipeline` and `http` write into [`Metrics`] and
+//! [`Health`], the HTTP surface reads them out.
 
 pub mod disk;
 pub mod health;

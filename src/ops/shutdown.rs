@@ -4,9 +4,13 @@ use tokio::signal::unix::{SignalKind, signal};
 
 /// Waits for the first SIGTERM or SIGINT.
 ///
-/// Cancel safety: the handlers are installed on the first poll; dropping it forgets a signal that came in between.
+/// Cancel safety: the handlers are installed on the first poll; dropping it forgets a signal that
+/// came in between.
 pub async fn requested() -> std::io::Result<()> {
-    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    let (mut terminate, mut interrupt) = (
+        signal(SignalKind::terminate())?,
+        signal(SignalKind::interrupt())?,
+    );
     let name = tokio::select! {
         _ = terminate.recv() => "SIGTERM",
         _ = interrupt.recv() => "SIGINT",

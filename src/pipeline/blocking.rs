@@ -12,9 +12,11 @@ pub(super) struct Panicked;
 
 /// Runs `work` on a blocking thread, inside the caller's span.
 ///
-/// Cancel safety: dropped before the work began, it never begins; dropped later, the work runs to its end and its
-/// outcome is lost.
-pub(super) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Panicked> {
+/// Cancel safety: dropped before the work began, it never begins; dropped later, the work runs to
+/// its end and its outcome is lost.
+pub(super) async fn blocking<T: Send + 'static>(
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, Panicked> {
     let span = Span::current();
     AbortOnDrop(spawn_blocking(move || span.in_scope(work))).await
 }

@@ -8,10 +8,18 @@ use std::sync::Arc;
 
 impl Service {
     /// Changes a reference's metadata; its image and descriptor stay.
-    pub async fn update(self: &Arc<Self>, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, PipelineError> {
+    pub async fn update(
+        self: &Arc<Self>,
+        id: ReferenceId,
+        patch: ReferencePatch,
+    ) -> Result<Reference, PipelineError> {
         let metadata = patch.metadata.clone().flatten();
-        self.check_metadata(&ReferenceFields { metadata, ..Default::default() })?;
-        self.write(move |service| service.update_now(id, patch)).await
+        self.check_metadata(&ReferenceFields {
+            metadata,
+            ..Default::default()
+        })?;
+        self.write(move |service| service.update_now(id, patch))
+            .await
     }
 
     /// Deletes a reference and returns what it was.
@@ -21,7 +29,8 @@ impl Service {
 
     /// Deletes a map with everything in it; returns how many references that were.
     pub async fn delete_map(self: &Arc<Self>, name: MapName) -> Result<u64, PipelineError> {
-        self.write(move |service| service.delete_map_now(&name)).await
+        self.write(move |service| service.delete_map_now(&name))
+            .await
     }
 
     /// Stores a map's calibration, or clears it: from the next query on it is in force.
@@ -30,18 +39,30 @@ impl Service {
         name: MapName,
         calibration: Option<Calibration>,
     ) -> Result<(), PipelineError> {
-        self.write(move |service| service.set_calibration_now(&name, calibration)).await
+        self.write(move |service| service.set_calibration_now(&name, calibration))
+            .await
     }
 
-    fn update_now(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, PipelineError> {
+    fn update_now(
+        &self,
+        id: ReferenceId,
+        patch: ReferencePatch,
+    ) -> Result<Reference, PipelineError> {
         let moves = patch.location.is_some() || patch.captured_at.is_some();
         let entry = self.maps.entry(&self.store.get(id)?.map);
         let _changing = entry.changing();
         let reference = self.store.update(id, patch)?;
         if moves {
-            let ReferenceFields { location, captured_at, .. } = reference.fields;
+            let ReferenceFields {
+                location,
+                captured_at,
+                ..
+            } = reference.fields;
             let change = || Change::Moved(id, location, captured_at);
-            entry.live().iter().for_each(|live| change().apply(&live.index));
+            entry
+                .live()
+                .iter()
+                .for_each(|live| change().apply(&live.index));
             entry.note(change());
         }
         Ok(reference)
@@ -78,10 +99,16 @@ impl Service {
         Ok(deleted)
     }
 
-    fn set_calibration_now(&self, name: &MapName, calibration: Option<Calibration>) -> Result<(), PipelineError> {
+    fn set_calibration_now(
+        &self,
+        name: &MapName,
+        calibration: Option<Calibration>,
+    ) -> Result<(), PipelineError> {
         let (entry, _) = self.existing(name)?;
         let _changing = entry.changing();
-        calibration.iter().try_for_each(|calibration| self.trust.check(name, calibration))?;
+        calibration
+            .iter()
+            .try_for_each(|calibration| self.trust.check(name, calibration))?;
         self.store.set_calibration(name, calibration.clone())?;
         if let Some(live) = entry.live() {
             live.calibrate(calibration);
@@ -91,8 +118,8 @@ impl Service {
 
     /// Changes the store in turn with others.
     ///
-    /// Cancel safety: dropped while waiting, nothing is written; dropped later, the write runs to its end, because
-    /// store and index change together.
+    /// Cancel safety: dropped while waiting, nothing is written; dropped later, the write runs to
+    /// its end, because store and index change together.
     pub(super) async fn write<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&Self) -> Result<T, PipelineError> + Send + 'static,

@@ -7,12 +7,15 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PipelineConfig {
-    /// Queries, and beside them references, that may wait for or be in compute; one more is told to come back later.
+    /// Queries, and beside them references, that may wait for or be in compute; one more is told to
+    /// come back later.
     pub queue_capacity: usize,
-    /// Longest time a query may wait for its turn, in milliseconds; one that would wait longer is told at once.
+    /// Longest time a query may wait for its turn, in milliseconds; one that would wait longer is
+    /// told at once.
     pub max_wait_ms: u64,
-    /// Listings and look-ups that read the store at once. At least two fewer than `store.readers`, so that queries
-    /// always find a connection; one that gets no turn within `max_wait_ms` is told to come back later.
+    /// Listings and look-ups that read the store at once. At least two fewer than `store.readers`,
+    /// so that queries always find a connection; one that gets no turn within `max_wait_ms` is told
+    /// to come back later.
     pub store_reads: usize,
     /// Changes and deletions under way at once, with the same wait.
     pub store_writes: usize,
@@ -30,7 +33,8 @@ pub struct PipelineConfig {
     pub answer_reserve_ms: u64,
     /// Resident bytes above which nothing new is taken in; 0 means 85% of what the process may use.
     pub memory_watermark_bytes: u64,
-    /// Free bytes on the store's disk below which nothing new is taken in (a twentieth of a small disk).
+    /// Free bytes on the store's disk below which nothing new is taken in (a twentieth of a small
+    /// disk).
     pub disk_reserve_bytes: u64,
     /// Longest metadata of a reference in bytes of JSON.
     pub max_metadata_bytes: usize,
@@ -72,14 +76,20 @@ impl PipelineConfig {
             return Err(InvalidValue::new(field, "0 would refuse everything"));
         }
         if self.top_k.max(self.candidates) > self.max_candidates {
-            return Err(InvalidValue::new("pipeline.max_candidates", "it is below the default top_k or candidates"));
+            return Err(InvalidValue::new(
+                "pipeline.max_candidates",
+                "it is below the default top_k or candidates",
+            ));
         }
         let places = [
             ("pipeline.queue_capacity", self.queue_capacity),
             ("pipeline.store_reads", self.store_reads),
             ("pipeline.store_writes", self.store_writes),
         ];
-        if let Some((field, _)) = places.iter().find(|(_, places)| *places > tokio::sync::Semaphore::MAX_PERMITS) {
+        if let Some((field, _)) = places
+            .iter()
+            .find(|(_, places)| *places > tokio::sync::Semaphore::MAX_PERMITS)
+        {
             return Err(InvalidValue::new(field, "it is too large"));
         }
         Ok(())
@@ -90,7 +100,10 @@ impl PipelineConfig {
         if (1..=self.max_candidates).contains(&count) {
             Ok(count)
         } else {
-            Err(InvalidValue::new(field, format!("{count} is outside 1 to {}", self.max_candidates)))
+            Err(InvalidValue::new(
+                field,
+                format!("{count} is outside 1 to {}", self.max_candidates),
+            ))
         }
     }
 }

@@ -50,7 +50,9 @@ pub enum PipelineError {
         source: ExtractError,
     },
     /// The calibration was fitted on scores of another re-ranking.
-    #[error("the calibration for map {map} was fitted for re-ranking \"{given}\", this server's is \"{server}\"")]
+    #[error(
+        "the calibration for map {map} was fitted for re-ranking \"{given}\", this server's is \"{server}\""
+    )]
     RerankMismatch {
         /// The map.
         map: MapName,
@@ -68,7 +70,9 @@ pub enum PipelineError {
         external_id: ExternalId,
     },
     /// The queue is full, or too long to wait in.
-    #[error("{waiting} requests are waiting or being computed, more than can be answered soon enough")]
+    #[error(
+        "{waiting} requests are waiting or being computed, more than can be answered soon enough"
+    )]
     Overloaded {
         /// Requests in the queue.
         waiting: usize,

@@ -1,8 +1,9 @@
 //! Bytes to a descriptor: decoding beside, extraction behind the one compute worker.
 //!
-//! Blocking work cannot be stopped once it has begun, but whoever waits for it may leave at any moment. So every
-//! permit, lock and ticket that bounds such work moves into it and is given back when the work itself ends: clients
-//! that hang up and come again get no more threads than clients that stay.
+//! Blocking work cannot be stopped once it has begun, but whoever waits for it may leave at any
+//! moment. So every permit, lock and ticket that bounds such work moves into it and is given back
+//! when the work itself ends: clients that hang up and come again get no more threads than clients
+//! that stay.
 
 use super::admission::Ticket;
 use super::blocking::{Panicked, blocking};
@@ -33,8 +34,8 @@ pub(super) struct Extraction {
     decoders: Arc<Semaphore>,
     /// First come, first served; a waiter that is dropped leaves the line.
     worker: Arc<Mutex<()>>,
-    /// Held by the one reference that stands in that line; the others wait here, so that a query never waits for more
-    /// than one of them.
+    /// Held by the one reference that stands in that line; the others wait here, so that a query
+    /// never waits for more than one of them.
     ingest: Arc<Mutex<()>>,
     metrics: Arc<Metrics>,
 }
@@ -49,7 +50,9 @@ impl Purpose {
     /// Fails once the deadline has passed, naming the stage that it kept from running.
     pub(super) fn not_passed(self, stage: &'static str) -> Result<(), PipelineError> {
         match self {
-            Self::Answer(deadline) if deadline.has_passed() => Err(PipelineError::DeadlineExceeded { stage }),
+            Self::Answer(deadline) if deadline.has_passed() => {
+                Err(PipelineError::DeadlineExceeded { stage })
+            }
             _ => Ok(()),
         }
     }
@@ -57,18 +60,26 @@ impl Purpose {
     /// Waits for `work` until the deadline.
     ///
     /// Cancel safety: as `work`, which is dropped when the deadline passes.
-    async fn in_time<T>(self, stage: &'static str, work: impl Future<Output = T>) -> Result<T, PipelineError> {
+    async fn in_time<T>(
+        self,
+        stage: &'static str,
+        work: impl Future<Output = T>,
+    ) -> Result<T, PipelineError> {
         match self {
-            Self::Answer(deadline) => {
-                timeout(deadline.remaining(), work).await.map_err(|_| PipelineError::DeadlineExceeded { stage })
-            }
+            Self::Answer(deadline) => timeout(deadline.remaining(), work)
+                .await
+                .map_err(|_| PipelineError::DeadlineExceeded { stage }),
             Self::Ingest => Ok(work.await),
         }
     }
 }
 
 impl Extraction {
-    pub(super) fn new(source: Arc<dyn DescriptorSource>, image: ImageConfig, metrics: Arc<Metrics>) -> Self {
+    pub(super) fn new(
+        source: Arc<dyn DescriptorSource>,
+        image: ImageConfig,
+        metrics: Arc<Metrics>,
+    ) -> Self {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         Self {
             source,
@@ -86,8 +97,8 @@ impl Extraction {
 
     /// What the model sees in `bytes`. `ticket` is kept until the last work for it has ended.
     ///
-    /// Cancel safety: dropped while waiting, nothing is computed; dropped later, what is being computed is finished
-    /// under the bounds it began with, and its outcome is lost.
+    /// Cancel safety: dropped while waiting, nothing is computed; dropped later, what is being
+    /// computed is finished under the bounds it began with, and its outcome is lost.
     pub(super) async fn describe(
         &self,
         bytes: Bytes,
@@ -108,8 +119,12 @@ impl Extraction {
         });
         let described = purpose.in_time("extraction", described).await?;
         timings.record(&self.metrics, Stage::Extract, started.elapsed());
-        let mut descriptors = described.map_err(|_| PipelineError::Panicked { stage: "extraction" })??;
-        descriptors.pop().ok_or(PipelineError::Panicked { stage: "extraction" })
+        let mut descriptors = described.map_err(|_| PipelineError::Panicked {
+            stage: "extraction",
+        })??;
+        descriptors.pop().ok_or(PipelineError::Panicked {
+            stage: "extraction",
+        })
     }
 
     async fn turn(&self, purpose: Purpose) -> Turn {
@@ -117,7 +132,10 @@ impl Extraction {
             Purpose::Ingest => Some(self.ingest.clone().lock_owned().await),
             Purpose::Answer(_) => None,
         };
-        Turn { _worker: self.worker.clone().lock_owned().await, _ingest: ingest }
+        Turn {
+            _worker: self.worker.clone().lock_owned().await,
+            _ingest: ingest,
+        }
     }
 
     async fn decode(
@@ -138,17 +156,23 @@ impl Extraction {
         Ok(decoded?)
     }
 
-    /// Runs `work` on the bytes of an image, beside the model, on no more threads than there are cores.
+    /// Runs `work` on the bytes of an image, beside the model, on no more threads than there are
+    /// cores.
     ///
-    /// Cancel safety: dropped before the work began, it never begins; dropped later, it holds its place and `ticket`
-    /// until it ends.
+    /// Cancel safety: dropped before the work began, it never begins; dropped later, it holds its
+    /// place and `ticket` until it ends.
     pub(super) async fn beside<T: Send + 'static>(
         &self,
         ticket: &Arc<Ticket>,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<Result<T, Panicked>, PipelineError> {
         // The semaphore is never closed.
-        let place = self.decoders.clone().acquire_owned().await.map_err(|_| PipelineError::ShuttingDown)?;
+        let place = self
+            .decoders
+            .clone()
+            .acquire_owned()
+            .await
+            .map_err(|_| PipelineError::ShuttingDown)?;
         let ticket = ticket.clone();
         Ok(blocking(move || {
             let done = work();

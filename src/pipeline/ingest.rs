@@ -39,9 +39,13 @@ pub struct IngestAnswer {
 impl Service {
     /// Takes in one reference; returns once it is fsynced and in the index.
     ///
-    /// Cancel safety: dropped before the commit began, nothing is stored; dropped later, the reference is stored and
-    /// indexed all the same, and repeating the request with its external id finds it.
-    pub async fn ingest(self: &Arc<Self>, request: IngestRequest) -> Result<IngestAnswer, PipelineError> {
+    /// Cancel safety: dropped before the commit began, nothing is stored; dropped later, the
+    /// reference is stored and indexed all the same, and repeating the request with its external id
+    /// finds it.
+    pub async fn ingest(
+        self: &Arc<Self>,
+        request: IngestRequest,
+    ) -> Result<IngestAnswer, PipelineError> {
         self.may_store()?;
         self.check_metadata(&request.fields)?;
         let model = self.extraction.source().model_id().clone();
@@ -51,11 +55,24 @@ impl Service {
         let ticket = Arc::new(self.references.enter(Duration::MAX)?);
         let content_hash = self.hash(request.image.clone(), &ticket).await?;
         if let Some(reference) = self.known(&request, content_hash).await? {
-            return Ok(IngestAnswer { reference, created: false, timings: Timings::default() });
+            return Ok(IngestAnswer {
+                reference,
+                created: false,
+                timings: Timings::default(),
+            });
         }
         let mut timings = Timings::default();
-        let descriptor = self.extraction.describe(request.image, Purpose::Ingest, &ticket, &mut timings).await?;
-        let new = NewReference { map: request.map, fields: request.fields, content_hash, model, descriptor };
+        let descriptor = self
+            .extraction
+            .describe(request.image, Purpose::Ingest, &ticket, &mut timings)
+            .await?;
+        let new = NewReference {
+            map: request.map,
+            fields: request.fields,
+            content_hash,
+            model,
+            descriptor,
+        };
         let (service, started) = (self.clone(), Instant::now());
         let committed = blocking(move || {
             let committed = service.commit(new);
@@ -69,7 +86,11 @@ impl Service {
             Inserted::Created(reference) => (reference, true),
             Inserted::AlreadyThere(reference) => (reference, false),
         };
-        Ok(IngestAnswer { reference, created, timings })
+        Ok(IngestAnswer {
+            reference,
+            created,
+            timings,
+        })
     }
 
     /// Refuses while disk or memory is short. Deleting is never refused.
@@ -78,13 +99,17 @@ impl Service {
             self.metrics.rejected(Rejection::DiskFull);
             return Err(PipelineError::DiskFull);
         }
-        self.memory.check().inspect_err(|_| self.metrics.rejected(Rejection::MemoryPressure))?;
+        self.memory
+            .check()
+            .inspect_err(|_| self.metrics.rejected(Rejection::MemoryPressure))?;
         Ok(())
     }
 
     /// Bounds the metadata of a reference.
     pub(super) fn check_metadata(&self, fields: &ReferenceFields) -> Result<(), PipelineError> {
-        let Some(metadata) = &fields.metadata else { return Ok(()) };
+        let Some(metadata) = &fields.metadata else {
+            return Ok(());
+        };
         let length = serde_json::to_vec(metadata).map_or(usize::MAX, |text| text.len());
         let bound = self.config.max_metadata_bytes;
         if length > bound {
@@ -95,23 +120,43 @@ impl Service {
     }
 
     async fn hash(&self, image: Bytes, ticket: &Arc<Ticket>) -> Result<ContentHash, PipelineError> {
-        let hashed = self.extraction.beside(ticket, move || ContentHash::of(&image)).await?;
+        let hashed = self
+            .extraction
+            .beside(ticket, move || ContentHash::of(&image))
+            .await?;
         hashed.map_err(|_| PipelineError::Panicked { stage: "hashing" })
     }
 
-    /// The reference that this request repeats, found before anything costly; a conflict if it is another image.
+    /// The reference that this request repeats, found before anything costly; a conflict if it is
+    /// another image.
     async fn known(
         self: &Arc<Self>,
         request: &IngestRequest,
         content_hash: ContentHash,
     ) -> Result<Option<Reference>, PipelineError> {
-        let Some(external_id) = request.fields.external_id.clone() else { return Ok(None) };
-        match self.find_external(request.map.clone(), external_id.clone()).await {
+        let Some(external_id) = request.fields.external_id.clone() else {
+            return Ok(None);
+        };
+        match self
+            .find_external(request.map.clone(), external_id.clone())
+            .await
+        {
             Ok(Some(reference)) if reference.content_hash == content_hash => Ok(Some(reference)),
-            Ok(Some(_)) => Err(PipelineError::ExternalIdConflict { map: request.map.clone(), external_id }),
+            Ok(Some(_)) => Err(PipelineError::ExternalIdConflict {
+                map: request.map.clone(),
+                external_id,
+            }),
             Ok(None) => Ok(None),
-            // The map is made by this very request; or the record is damaged, and this image may replace it.
-            Err(error) if matches!(error.code(), ErrorCode::MapNotFound | ErrorCode::CorruptRecord) => Ok(None),
+            // The map is made by this very request; or the record is damaged, and this image may
+            // replace it.
+            Err(error)
+                if matches!(
+                    error.code(),
+                    ErrorCode::MapNotFound | ErrorCode::CorruptRecord
+                ) =>
+            {
+                Ok(None)
+            }
             Err(error) => Err(error),
         }
     }
@@ -126,18 +171,23 @@ impl Service {
             new.model = live.model.clone();
         }
         let model = new.model.clone();
-        let (global, patch_bytes) = (new.descriptor.global.clone(), new.descriptor.patches.heap_bytes());
+        let (global, patch_bytes) = (
+            new.descriptor.global.clone(),
+            new.descriptor.patches.heap_bytes(),
+        );
         let inserted = self.store.insert(new).inspect_err(|error| {
             if error.code() == ErrorCode::DiskFull {
                 self.health.set_disk_full(true);
                 self.metrics.rejected(Rejection::DiskFull);
             }
         });
-        // A damaged reference that this one replaces leaves the index before anyone may miss it in the store.
+        // A damaged reference that this one replaces leaves the index before anyone may miss it in
+        // the store.
         self.follow_damage();
         let inserted = inserted?;
         if let Inserted::Created(reference) = &inserted {
-            self.metrics.stored_descriptor(global.len() * size_of::<f32>(), patch_bytes);
+            self.metrics
+                .stored_descriptor(global.len() * size_of::<f32>(), patch_bytes);
             entry.live_or_create(&model).index.insert(IndexEntry {
                 id: reference.id,
                 global,

@@ -1,9 +1,10 @@
 //! The maps that can be searched, each with its index.
 //!
-//! A map's entry outlives the map: deleting empties it, the next insert fills it again, so that whoever waits for
-//! its lock meanwhile never writes into an orphan. Inserts share the lock, deletions and changes take it alone;
-//! both hold it over commit and index together, so the index never keeps what the store has lost. While another head
-//! is prepared for a map, what changes meanwhile is noted, so that the new index can catch up.
+//! A map's entry outlives the map: deleting empties it, the next insert fills it again, so that
+//! whoever waits for its lock meanwhile never writes into an orphan. Inserts share the lock,
+//! deletions and changes take it alone; both hold it over commit and index together, so the index
+//! never keeps what the store has lost. While another head is prepared for a map, what changes
+//! meanwhile is noted, so that the new index can catch up.
 
 use super::PipelineError;
 use crate::extract::Head;
@@ -65,8 +66,14 @@ impl Maps {
     }
 
     /// The map, which must exist and be comparable with what a server of `model` sees.
-    pub(super) fn comparable(&self, name: &MapName, model: &ModelId) -> Result<Arc<LiveMap>, PipelineError> {
-        let live = self.live(name).ok_or_else(|| PipelineError::MapNotFound(name.clone()))?;
+    pub(super) fn comparable(
+        &self,
+        name: &MapName,
+        model: &ModelId,
+    ) -> Result<Arc<LiveMap>, PipelineError> {
+        let live = self
+            .live(name)
+            .ok_or_else(|| PipelineError::MapNotFound(name.clone()))?;
         live.check_model(name, model)?;
         Ok(live)
     }
@@ -86,7 +93,10 @@ impl Maps {
 
     /// All maps that exist.
     pub(super) fn all(&self) -> Vec<(MapName, Arc<LiveMap>)> {
-        read(&self.0).iter().filter_map(|(name, entry)| Some((name.clone(), entry.live()?))).collect()
+        read(&self.0)
+            .iter()
+            .filter_map(|(name, entry)| Some((name.clone(), entry.live()?)))
+            .collect()
     }
 }
 
@@ -110,7 +120,14 @@ impl MapEntry {
         if let Some(live) = self.live() {
             return live;
         }
-        let fresh = || Arc::new(LiveMap::new(model.clone(), Projection::Server, MapIndex::default(), None));
+        let fresh = || {
+            Arc::new(LiveMap::new(
+                model.clone(),
+                Projection::Server,
+                MapIndex::default(),
+                None,
+            ))
+        };
         write(&self.live).get_or_insert_with(fresh).clone()
     }
 
@@ -130,8 +147,8 @@ impl MapEntry {
         begins
     }
 
-    /// Notes a change, if anyone wants to know: before the index in force is changed, or while [`MapEntry::changing`] is
-    /// held.
+    /// Notes a change, if anyone wants to know: before the index in force is changed, or while
+    /// [`MapEntry::changing`] is held.
     pub(super) fn note(&self, change: Change) {
         if let Some(journal) = lock(&self.journal).as_mut() {
             journal.push(change);
@@ -153,7 +170,12 @@ impl Change {
             // Only what is in the index moves; a damaged reference is not.
             Self::Moved(id, location, captured_at) => {
                 if let Some(global) = index.global(id) {
-                    index.insert(IndexEntry { id, global, location, captured_at });
+                    index.insert(IndexEntry {
+                        id,
+                        global,
+                        location,
+                        captured_at,
+                    });
                 }
             }
         }
@@ -167,14 +189,21 @@ impl LiveMap {
         index: MapIndex,
         calibration: Option<Calibration>,
     ) -> Self {
-        Self { model, projection, index, calibration: RwLock::new(calibration.map(Arc::new)) }
+        Self {
+            model,
+            projection,
+            index,
+            calibration: RwLock::new(calibration.map(Arc::new)),
+        }
     }
 
     /// The global descriptor, comparable with this map's, of what the server saw.
     pub(super) fn global_of<'d>(&self, descriptor: &'d Descriptor) -> Cow<'d, [f32]> {
         match &self.projection {
             Projection::Own(head) => Cow::Owned(head.project(&descriptor.pooled)),
-            Projection::Server | Projection::Foreign | Projection::Lost => Cow::Borrowed(&descriptor.global),
+            Projection::Server | Projection::Foreign | Projection::Lost => {
+                Cow::Borrowed(&descriptor.global)
+            }
         }
     }
 
@@ -205,7 +234,8 @@ fn lock<T>(lock: &Mutex<T>) -> MutexGuard<'_, T> {
     lock.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-// No code panics while it holds one of these locks for writing, and the values stay whole if it did.
+// No code panics while it holds one of these locks for writing, and the values stay whole if it
+// did.
 fn read<T>(lock: &RwLock<T>) -> RwLockReadGuard<'_, T> {
     lock.read().unwrap_or_else(PoisonError::into_inner)
 }

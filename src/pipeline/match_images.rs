@@ -52,34 +52,56 @@ pub struct MatchAnswer {
 impl Service {
     /// Matches an image against another one or against a reference.
     ///
-    /// Cancel safety: dropped while waiting, nothing further is computed; what is being computed is finished in its
-    /// place in the queue.
-    pub async fn match_images(self: &Arc<Self>, query: Bytes, other: MatchSide) -> Result<MatchAnswer, PipelineError> {
+    /// Cancel safety: dropped while waiting, nothing further is computed; what is being computed is
+    /// finished in its place in the queue.
+    pub async fn match_images(
+        self: &Arc<Self>,
+        query: Bytes,
+        other: MatchSide,
+    ) -> Result<MatchAnswer, PipelineError> {
         let outcome = self.matched(query, other).await;
         self.count_if_late(&outcome);
         outcome
     }
 
-    async fn matched(self: &Arc<Self>, query: Bytes, other: MatchSide) -> Result<MatchAnswer, PipelineError> {
-        let purpose = Purpose::Answer(Deadline::after(Duration::from_millis(self.config.deadline_ms)));
+    async fn matched(
+        self: &Arc<Self>,
+        query: Bytes,
+        other: MatchSide,
+    ) -> Result<MatchAnswer, PipelineError> {
+        let purpose = Purpose::Answer(Deadline::after(Duration::from_millis(
+            self.config.deadline_ms,
+        )));
         let other = match other {
             MatchSide::Reference(id) => Side::Patches(self.stored_patches(id).await?),
             MatchSide::Image(bytes) => Side::Image(bytes),
         };
         let ticket = Arc::new(self.queries.enter(self.patience())?);
         let mut timings = Timings::default();
-        let query = Arc::new(self.extraction.describe(query, purpose, &ticket, &mut timings).await?.patches);
+        let query = Arc::new(
+            self.extraction
+                .describe(query, purpose, &ticket, &mut timings)
+                .await?
+                .patches,
+        );
         let reference = match other {
             Side::Patches(patches) => patches,
-            Side::Image(bytes) => {
-                Arc::new(self.extraction.describe(bytes, purpose, &ticket, &mut timings).await?.patches)
-            }
+            Side::Image(bytes) => Arc::new(
+                self.extraction
+                    .describe(bytes, purpose, &ticket, &mut timings)
+                    .await?
+                    .patches,
+            ),
         };
         let (service, started) = (self.clone(), Instant::now());
         let explained = blocking(move || {
             let combinations = service.reranker.explain(&query, &reference);
             drop(ticket);
-            Matched { query, reference, combinations }
+            Matched {
+                query,
+                reference,
+                combinations,
+            }
         })
         .await;
         timings.record(&self.metrics, Stage::Rerank, started.elapsed());
@@ -92,7 +114,10 @@ impl Service {
         })
     }
 
-    async fn stored_patches(self: &Arc<Self>, id: ReferenceId) -> Result<Arc<PackedPatches>, PipelineError> {
+    async fn stored_patches(
+        self: &Arc<Self>,
+        id: ReferenceId,
+    ) -> Result<Arc<PackedPatches>, PipelineError> {
         let reference = self.reference(id).await?;
         let map: MapName = reference.map;
         self.in_turn(&self.store_reads, move |service| {

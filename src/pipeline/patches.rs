@@ -27,11 +27,18 @@ impl quick_cache::Weighter<ReferenceId, Arc<PackedPatches>> for ByBytes {
 impl PatchCache {
     pub(super) fn new(bytes: u64, metrics: Arc<Metrics>) -> Self {
         let items = (bytes / TYPICAL_BYTES).max(1) as usize;
-        Self { cache: Cache::with_weighter(items, bytes, ByBytes), metrics }
+        Self {
+            cache: Cache::with_weighter(items, bytes, ByBytes),
+            metrics,
+        }
     }
 
     /// From memory, else from the store.
-    pub(super) fn load(&self, store: &dyn PlaceStore, id: ReferenceId) -> Result<Arc<PackedPatches>, StoreError> {
+    pub(super) fn load(
+        &self,
+        store: &dyn PlaceStore,
+        id: ReferenceId,
+    ) -> Result<Arc<PackedPatches>, StoreError> {
         if let Some(patches) = self.cache.get(&id) {
             self.metrics.cache_lookup(true);
             return Ok(patches);

@@ -1,4 +1,5 @@
-//! A photo to ranked places: global search, then re-ranking of the candidates (paper III-A, III-D, III-E).
+//! A photo to ranked places: global search, then re-ranking of the candidates (paper III-A, III-D,
+//! III-E).
 
 use super::blocking::blocking;
 use super::extraction::Purpose;
@@ -10,7 +11,9 @@ use crate::ops::metrics::Rejection;
 use crate::rerank::{PairScore, Reranked};
 use crate::search::Neighbour;
 use crate::store::StoreError;
-use crate::types::{Deadline, Descriptor, MapName, ModelId, Reference, ReferenceFilter, ReferenceId};
+use crate::types::{
+    Deadline, Descriptor, MapName, ModelId, Reference, ReferenceFilter, ReferenceId,
+};
 use bytes::Bytes;
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -88,9 +91,12 @@ struct Plan {
 impl Service {
     /// Answers which places of a map a photo may show.
     ///
-    /// Cancel safety: dropped while waiting, nothing further is computed; what is being computed is finished in its
-    /// place in the queue.
-    pub async fn query(self: &Arc<Self>, request: QueryRequest) -> Result<QueryAnswer, PipelineError> {
+    /// Cancel safety: dropped while waiting, nothing further is computed; what is being computed is
+    /// finished in its place in the queue.
+    pub async fn query(
+        self: &Arc<Self>,
+        request: QueryRequest,
+    ) -> Result<QueryAnswer, PipelineError> {
         let outcome = self.answer(request).await;
         self.count_if_late(&outcome);
         outcome
@@ -105,7 +111,11 @@ impl Service {
     async fn answer(self: &Arc<Self>, request: QueryRequest) -> Result<QueryAnswer, PipelineError> {
         let plan = match self.plan(&request.map, request.options) {
             Err(PipelineError::MapNotFound(map)) => {
-                return self.in_turn(&self.store_reads, move |service| Err(service.why_no_map(&map))).await;
+                return self
+                    .in_turn(&self.store_reads, move |service| {
+                        Err(service.why_no_map(&map))
+                    })
+                    .await;
             }
             plan => plan?,
         };
@@ -114,7 +124,10 @@ impl Service {
         purpose.not_passed("decoding")?;
         let ticket = Arc::new(self.queries.enter(patience)?);
         let mut timings = Timings::default();
-        let descriptor = self.extraction.describe(request.image, purpose, &ticket, &mut timings).await?;
+        let descriptor = self
+            .extraction
+            .describe(request.image, purpose, &ticket, &mut timings)
+            .await?;
         purpose.not_passed("search")?;
         let service = self.clone();
         let ranked = blocking(move || {
@@ -128,11 +141,15 @@ impl Service {
     }
 
     fn plan(&self, map: &MapName, options: QueryOptions) -> Result<Plan, PipelineError> {
-        let top_k = self.config.check_count("top_k", options.top_k.unwrap_or(self.config.top_k))?;
+        let top_k = self
+            .config
+            .check_count("top_k", options.top_k.unwrap_or(self.config.top_k))?;
         let candidates = options.candidates.unwrap_or(self.config.candidates);
         Ok(Plan {
             name: map.clone(),
-            map: self.maps.comparable(map, self.extraction.source().model_id())?,
+            map: self
+                .maps
+                .comparable(map, self.extraction.source().model_id())?,
             top_k,
             candidates: self.config.check_count("candidates", candidates)?,
             rerank: options.rerank.unwrap_or(true),
@@ -143,24 +160,59 @@ impl Service {
         })
     }
 
-    fn rank(&self, plan: &Plan, query: &Descriptor, mut timings: Timings) -> Result<QueryAnswer, PipelineError> {
+    fn rank(
+        &self,
+        plan: &Plan,
+        query: &Descriptor,
+        mut timings: Timings,
+    ) -> Result<QueryAnswer, PipelineError> {
         let started = Instant::now();
-        let fetched = if plan.rerank { plan.candidates.max(plan.top_k) } else { plan.top_k };
-        let neighbours = plan.map.index.search(&plan.map.global_of(query), fetched, &plan.filter);
+        let fetched = if plan.rerank {
+            plan.candidates.max(plan.top_k)
+        } else {
+            plan.top_k
+        };
+        let neighbours = plan
+            .map
+            .index
+            .search(&plan.map.global_of(query), fetched, &plan.filter);
         timings.record(&self.metrics, Stage::Search, started.elapsed());
-        let reranked = if plan.rerank { self.rerank(plan, query, &neighbours, &mut timings)? } else { None };
+        let reranked = if plan.rerank {
+            self.rerank(plan, query, &neighbours, &mut timings)?
+        } else {
+            None
+        };
         let was_reranked = reranked.is_some();
-        let placed =
-            reranked.unwrap_or_else(|| neighbours.iter().map(|&neighbour| Placed { neighbour, score: None }).collect());
+        let placed = reranked.unwrap_or_else(|| {
+            neighbours
+                .iter()
+                .map(|&neighbour| Placed {
+                    neighbour,
+                    score: None,
+                })
+                .collect()
+        });
         let results = self.with_metadata(plan, placed)?;
         let best = results.first();
-        let verdict = self.trust.judge(&plan.map.model, plan.map.calibration().as_deref(), best);
-        let top1 = best.and_then(|best| best.score.as_ref()).map_or(0, |score| score.spatial_score);
-        self.metrics.query_answered(was_reranked.then_some(top1), verdict.matched);
-        Ok(QueryAnswer { results, reranked: was_reranked, verdict, timings, model: plan.map.model.clone() })
+        let verdict = self
+            .trust
+            .judge(&plan.map.model, plan.map.calibration().as_deref(), best);
+        let top1 = best
+            .and_then(|best| best.score.as_ref())
+            .map_or(0, |score| score.spatial_score);
+        self.metrics
+            .query_answered(was_reranked.then_some(top1), verdict.matched);
+        Ok(QueryAnswer {
+            results,
+            reranked: was_reranked,
+            verdict,
+            timings,
+            model: plan.map.model.clone(),
+        })
     }
 
-    /// The candidates in their new order, followed by the neighbours beyond them; `None` if time ran out.
+    /// The candidates in their new order, followed by the neighbours beyond them; `None` if time
+    /// ran out.
     fn rerank(
         &self,
         plan: &Plan,
@@ -169,7 +221,12 @@ impl Service {
         timings: &mut Timings,
     ) -> Result<Option<Vec<Placed>>, PipelineError> {
         let reserve = Duration::from_millis(self.config.answer_reserve_ms);
-        let Some(time_left) = plan.deadline.remaining().checked_sub(reserve).filter(|left| !left.is_zero()) else {
+        let Some(time_left) = plan
+            .deadline
+            .remaining()
+            .checked_sub(reserve)
+            .filter(|left| !left.is_zero())
+        else {
             return Ok(None);
         };
         let (candidates, beyond) = neighbours.split_at(neighbours.len().min(plan.candidates));
@@ -182,60 +239,96 @@ impl Service {
             loading_ns.fetch_add(begun.elapsed().as_nanos() as u64, Ordering::Relaxed);
             loaded
         };
-        let outcome = self.reranker.rerank(&query.patches, candidates.len(), load, Some(Deadline::after(time_left)));
+        let outcome = self.reranker.rerank(
+            &query.patches,
+            candidates.len(),
+            load,
+            Some(Deadline::after(time_left)),
+        );
         self.record_rerank(started.elapsed(), loading_ns.into_inner(), timings);
-        let Reranked::Complete { ranked, failed } = outcome else { return Ok(None) };
+        let Reranked::Complete { ranked, failed } = outcome else {
+            return Ok(None);
+        };
         for (i, error) in failed {
             match error.code() {
                 // Deleted since the search, or damaged: the others are answered.
-                ErrorCode::ReferenceNotFound | ErrorCode::CorruptRecord => self.withdraw(plan, candidates[i].id),
+                ErrorCode::ReferenceNotFound | ErrorCode::CorruptRecord => {
+                    self.withdraw(plan, candidates[i].id)
+                }
                 _ => return Err(error.into()),
             }
         }
-        let scored = ranked
-            .into_iter()
-            .map(|ranked| Placed { neighbour: candidates[ranked.candidate], score: Some(ranked.score) });
-        let unscored = beyond.iter().map(|&neighbour| Placed { neighbour, score: None });
+        let scored = ranked.into_iter().map(|ranked| Placed {
+            neighbour: candidates[ranked.candidate],
+            score: Some(ranked.score),
+        });
+        let unscored = beyond.iter().map(|&neighbour| Placed {
+            neighbour,
+            score: None,
+        });
         Ok(Some(scored.chain(unscored).collect()))
     }
 
-    /// Loading runs inside re-ranking, on all threads: its share of the wall time is its sum over their number.
+    /// Loading runs inside re-ranking, on all threads: its share of the wall time is its sum over
+    /// their number.
     fn record_rerank(&self, wall: Duration, loading_ns: u64, timings: &mut Timings) {
-        let loading = Duration::from_nanos(loading_ns / rayon::current_num_threads().max(1) as u64).min(wall);
+        let loading =
+            Duration::from_nanos(loading_ns / rayon::current_num_threads().max(1) as u64).min(wall);
         timings.record(&self.metrics, Stage::Load, loading);
         timings.record(&self.metrics, Stage::Rerank, wall - loading);
     }
 
-    /// What the store does not serve is not searched again. Nothing but a deletion, or sending the image of a damaged
-    /// one again, takes a reference out of the store; both take it out of the index as well, so one that is in the index
-    /// and unknown to the store while no change is under way was lost.
+    /// What the store does not serve is not searched again. Nothing but a deletion, or sending the
+    /// image of a damaged one again, takes a reference out of the store; both take it out of the
+    /// index as well, so one that is in the index and unknown to the store while no change is under
+    /// way was lost.
     fn withdraw(&self, plan: &Plan, id: ReferenceId) {
         let entry = self.maps.entry(&plan.name);
         let _settled = entry.changing();
-        let searched = plan.map.index.remove(id) && entry.live().is_some_and(|live| Arc::ptr_eq(&live, &plan.map));
+        let searched = plan.map.index.remove(id)
+            && entry
+                .live()
+                .is_some_and(|live| Arc::ptr_eq(&live, &plan.map));
         self.patches.forget(id);
-        if searched && matches!(self.store.get(id), Err(StoreError::ReferenceNotFound { .. })) {
+        if searched
+            && matches!(
+                self.store.get(id),
+                Err(StoreError::ReferenceNotFound { .. })
+            )
+        {
             tracing::error!(reference = %id, "the store has lost a reference; check its database");
             self.metrics.corrupt_records(1);
         }
     }
 
     /// The first `top_k` that still exist.
-    fn with_metadata(&self, plan: &Plan, placed: Vec<Placed>) -> Result<Vec<QueryResult>, PipelineError> {
+    fn with_metadata(
+        &self,
+        plan: &Plan,
+        placed: Vec<Placed>,
+    ) -> Result<Vec<QueryResult>, PipelineError> {
         let top_k = plan.top_k;
         let mut results = Vec::with_capacity(top_k.min(placed.len()));
         let mut placed = placed.into_iter().peekable();
         while results.len() < top_k && placed.peek().is_some() {
             let batch: Vec<Placed> = placed.by_ref().take(top_k - results.len()).collect();
             let ids: Vec<ReferenceId> = batch.iter().map(|one| one.neighbour.id).collect();
-            let mut found: HashMap<ReferenceId, Reference> =
-                self.store.get_many(&ids)?.into_iter().map(|reference| (reference.id, reference)).collect();
+            let mut found: HashMap<ReferenceId, Reference> = self
+                .store
+                .get_many(&ids)?
+                .into_iter()
+                .map(|reference| (reference.id, reference))
+                .collect();
             results.extend(batch.into_iter().filter_map(|one| {
                 let Some(reference) = found.remove(&one.neighbour.id) else {
                     self.withdraw(plan, one.neighbour.id);
                     return None;
                 };
-                Some(QueryResult { reference, global_distance: one.neighbour.distance, score: one.score })
+                Some(QueryResult {
+                    reference,
+                    global_distance: one.neighbour.distance,
+                    score: one.score,
+                })
             }));
         }
         Ok(results)

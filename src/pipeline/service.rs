@@ -93,7 +93,8 @@ impl Service {
         map: MapName,
         external_id: ExternalId,
     ) -> Result<Option<Reference>, PipelineError> {
-        self.read(move |store| store.find_external(&map, &external_id)).await
+        self.read(move |store| store.find_external(&map, &external_id))
+            .await
     }
 
     /// A page of references, ascending by id.
@@ -103,7 +104,8 @@ impl Service {
         after: Option<ReferenceId>,
         limit: usize,
     ) -> Result<Page, PipelineError> {
-        self.read(move |store| store.list(map.as_ref(), after, limit)).await
+        self.read(move |store| store.list(map.as_ref(), after, limit))
+            .await
     }
 
     /// All maps by name.
@@ -120,20 +122,32 @@ impl Service {
     pub async fn observe(self: &Arc<Self>) {
         let maps = self.maps.all();
         let index: usize = maps.iter().map(|(_, live)| live.index.memory_bytes()).sum();
-        self.metrics.set_memory(MemoryComponent::Index, index as u64);
-        self.metrics.set_memory(MemoryComponent::Cache, self.patches.bytes());
-        self.metrics.set_memory(MemoryComponent::Model, self.extraction.source().memory_bytes());
         self.metrics
-            .set_references(maps.iter().map(|(name, live)| (name.to_string(), live.index.len() as u64)).collect());
+            .set_memory(MemoryComponent::Index, index as u64);
+        self.metrics
+            .set_memory(MemoryComponent::Cache, self.patches.bytes());
+        self.metrics.set_memory(
+            MemoryComponent::Model,
+            self.extraction.source().memory_bytes(),
+        );
+        self.metrics.set_references(
+            maps.iter()
+                .map(|(name, live)| (name.to_string(), live.index.len() as u64))
+                .collect(),
+        );
         // Never more than one at the store, whoever else asks; those see what this one finds.
-        let Ok(turn) = self.observing.clone().try_lock_owned() else { return };
+        let Ok(turn) = self.observing.clone().try_lock_owned() else {
+            return;
+        };
         let store = self.store.clone();
         let seen = blocking(move || {
             let seen = (store.footprint(), store.quarantined());
             drop(turn);
             seen
         });
-        let Ok((footprint, quarantined)) = seen.await else { return };
+        let Ok((footprint, quarantined)) = seen.await else {
+            return;
+        };
         match footprint {
             Ok((_, engine)) => self.metrics.set_memory(MemoryComponent::Sqlite, engine),
             Err(error) => tracing::warn!(%error, "the store's footprint could not be read"),
@@ -160,12 +174,21 @@ impl Service {
                 }
             }
         }
-        damage.withdrawn.iter().for_each(|&id| self.patches.forget(id));
+        damage
+            .withdrawn
+            .iter()
+            .for_each(|&id| self.patches.forget(id));
     }
 
     /// A map that lives.
-    pub(super) fn existing(&self, name: &MapName) -> Result<(Arc<MapEntry>, Arc<LiveMap>), PipelineError> {
-        let found = self.maps.get(name).and_then(|entry| Some((entry.clone(), entry.live()?)));
+    pub(super) fn existing(
+        &self,
+        name: &MapName,
+    ) -> Result<(Arc<MapEntry>, Arc<LiveMap>), PipelineError> {
+        let found = self
+            .maps
+            .get(name)
+            .and_then(|entry| Some((entry.clone(), entry.live()?)));
         found.ok_or_else(|| self.why_no_map(name))
     }
 
@@ -179,17 +202,20 @@ impl Service {
 
     /// Reads the store in turn with others.
     ///
-    /// Cancel safety: dropped while waiting, nothing is read; dropped later, the read holds its place until it ends.
+    /// Cancel safety: dropped while waiting, nothing is read; dropped later, the read holds its
+    /// place until it ends.
     pub(super) async fn read<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&dyn PlaceStore) -> Result<T, StoreError> + Send + 'static,
     ) -> Result<T, PipelineError> {
-        self.in_turn(&self.store_reads, |service| Ok(work(&*service.store)?)).await
+        self.in_turn(&self.store_reads, |service| Ok(work(&*service.store)?))
+            .await
     }
 
     /// Runs `work` when its turn has come, and follows what damage it met.
     ///
-    /// Cancel safety: dropped while waiting, nothing is done; dropped later, the work runs to its end in its place.
+    /// Cancel safety: dropped while waiting, nothing is done; dropped later, the work runs to its
+    /// end in its place.
     pub(super) async fn in_turn<T: Send + 'static>(
         self: &Arc<Self>,
         turns: &Turns,
@@ -203,6 +229,8 @@ impl Service {
             drop(place);
             outcome
         });
-        outcome.await.map_err(|_| PipelineError::Panicked { stage: "the store" })?
+        outcome
+            .await
+            .map_err(|_| PipelineError::Panicked { stage: "the store" })?
     }
 }

@@ -1,5 +1,5 @@
-//! From an open store to a service: every map's index is rebuilt from the store, the maps beside each other and each
-//! map's blocks while its next references are read, with visible progress.
+//! From an open store to a service: every map's index is rebuilt from the store, the maps beside
+//! each other and each map's blocks while its next references are read, with visible progress.
 
 use super::admission::{Admission, Turns};
 use super::extraction::Extraction;
@@ -80,8 +80,14 @@ fn build_indexes(
     health: &Health,
 ) -> Result<Maps, PipelineError> {
     let (maps, infos) = (Maps::default(), store.maps()?);
-    health.building_index(infos.iter().fold(0, |sum, info| sum.saturating_add(info.references)));
-    infos.par_iter().try_for_each(|info| build_index(store, source, health, info, &maps.entry(&info.name)))?;
+    health.building_index(
+        infos
+            .iter()
+            .fold(0, |sum, info| sum.saturating_add(info.references)),
+    );
+    infos
+        .par_iter()
+        .try_for_each(|info| build_index(store, source, health, info, &maps.entry(&info.name)))?;
     Ok(maps)
 }
 
@@ -95,7 +101,12 @@ fn build_index(
     let projection = projection(store, source, info)?;
     let model = info.model.clone();
     if let Projection::Foreign | Projection::Lost = projection {
-        entry.put(LiveMap::new(model, projection, MapIndex::default(), info.calibration.clone()));
+        entry.put(LiveMap::new(
+            model,
+            projection,
+            MapIndex::default(),
+            info.calibration.clone(),
+        ));
         return Ok(());
     }
     let mut entries = IndexBuilder::default();
@@ -113,13 +124,28 @@ fn build_index(
     }
     health.indexed(entries.len() as u64 % PROGRESS_STEP);
     tracing::info!(map = %info.name, references = entries.len(), "indexed");
-    entry.put(LiveMap::new(model, projection, entries.finish(), info.calibration.clone()));
+    entry.put(LiveMap::new(
+        model,
+        projection,
+        entries.finish(),
+        info.calibration.clone(),
+    ));
     Ok(())
 }
 
 pub(super) fn index_entry(row: GlobalRow) -> IndexEntry {
-    let GlobalRow { reference, global, location, captured_at } = row;
-    IndexEntry { id: reference, global, location, captured_at }
+    let GlobalRow {
+        reference,
+        global,
+        location,
+        captured_at,
+    } = row;
+    IndexEntry {
+        id: reference,
+        global,
+        location,
+        captured_at,
+    }
 }
 
 /// How this server makes descriptors that compare with the map's.
@@ -135,7 +161,9 @@ fn projection(
                 return Ok(Projection::Own(Arc::new(head)));
             }
             Ok(_) => {}
-            Err(error) => tracing::error!(map = %info.name, %error, "the map's head cannot be read by this release"),
+            Err(error) => {
+                tracing::error!(map = %info.name, %error, "the map's head cannot be read by this release")
+            }
         },
         Ok(None) => {}
         Err(error @ StoreError::CorruptHead { .. }) if info.model != *server => {

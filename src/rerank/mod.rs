@@ -1,5 +1,5 @@
-//! Key patches of a query against those of its candidates: mutual nearest neighbours, homography, score
-//! (paper III-D and III-E).
+//! Key patches of a query against those of its candidates: mutual nearest neighbours, homography,
+//! score (paper III-D and III-E).
 //!
 //! | module | step |
 //! |---|---|
@@ -7,7 +7,8 @@
 //! | `ransac`, `refine` | 7: the homography most pairs agree with |
 //! | `score` | 8: inliers added up over the configured unions of scales |
 //!
-//! Working memory is kept by each thread, so that scoring a candidate allocates nothing but its answer.
+//! Working memory is kept by each thread, so that scoring a candidate allocates nothing but its
+//! answer.
 
 mod mutual_nn;
 mod ransac;
@@ -31,9 +32,11 @@ pub struct RerankConfig {
     pub scales: Vec<ScaleSet>,
     /// Inlier tolerance in multiples of the base patch size.
     pub tolerance_patches: f32,
-    /// Most homographies scored for one combination; samples refused as degenerate or twisted do not count.
+    /// Most homographies scored for one combination; samples refused as degenerate or twisted do
+    /// not count.
     pub max_iterations: u32,
-    /// Probability with which the best homography should have been seen when the search stops early.
+    /// Probability with which the best homography should have been seen when the search stops
+    /// early.
     pub confidence: f64,
 }
 
@@ -42,7 +45,12 @@ const MOST_ITERATIONS: u32 = 1_000_000;
 
 impl Default for RerankConfig {
     fn default() -> Self {
-        Self { scales: ScaleSet::paper_default(), tolerance_patches: 1.5, max_iterations: 2000, confidence: 0.995 }
+        Self {
+            scales: ScaleSet::paper_default(),
+            tolerance_patches: 1.5,
+            max_iterations: 2000,
+            confidence: 0.995,
+        }
     }
 }
 
@@ -51,13 +59,24 @@ impl RerankConfig {
     pub fn check(&self) -> Result<(), InvalidValue> {
         let refuse = |field, reason: String| Err(InvalidValue::new(field, reason));
         if self.scales.is_empty() {
-            return refuse("rerank.scales", "no scale combination is given, so every S would be 0".into());
+            return refuse(
+                "rerank.scales",
+                "no scale combination is given, so every S would be 0".into(),
+            );
         }
-        if let Some(twice) = self.scales.iter().enumerate().find(|(i, set)| self.scales[..*i].contains(set)) {
+        if let Some(twice) = self
+            .scales
+            .iter()
+            .enumerate()
+            .find(|(i, set)| self.scales[..*i].contains(set))
+        {
             return refuse("rerank.scales", format!("{} is given twice", twice.1));
         }
         if !(self.tolerance_patches.is_finite() && self.tolerance_patches > 0.0) {
-            return refuse("rerank.tolerance_patches", format!("{} is not a positive number", self.tolerance_patches));
+            return refuse(
+                "rerank.tolerance_patches",
+                format!("{} is not a positive number", self.tolerance_patches),
+            );
         }
         if !(1..=MOST_ITERATIONS).contains(&self.max_iterations) {
             return refuse(
@@ -66,7 +85,10 @@ impl RerankConfig {
             );
         }
         if !(self.confidence > 0.0 && self.confidence < 1.0) {
-            return refuse("rerank.confidence", format!("{} is not between 0 and 1", self.confidence));
+            return refuse(
+                "rerank.confidence",
+                format!("{} is not between 0 and 1", self.confidence),
+            );
         }
         Ok(())
     }
@@ -74,8 +96,16 @@ impl RerankConfig {
     /// Everything that S depends on beyond the descriptors: `1,1+2,2+3:t1.5:i2000:c0.995`.
     pub fn id(&self) -> RerankId {
         let scales: Vec<String> = self.scales.iter().map(ToString::to_string).collect();
-        let Self { tolerance_patches, max_iterations, confidence, .. } = self;
-        RerankId::new(format!("{}:t{tolerance_patches}:i{max_iterations}:c{confidence}", scales.join(",")))
+        let Self {
+            tolerance_patches,
+            max_iterations,
+            confidence,
+            ..
+        } = self;
+        RerankId::new(format!(
+            "{}:t{tolerance_patches}:i{max_iterations}:c{confidence}",
+            scales.join(",")
+        ))
     }
 }
 
@@ -117,8 +147,8 @@ pub struct CombinationMatch {
     pub score: CombinationScore,
     /// Every mutual pair.
     pub correspondences: Vec<Correspondence>,
-    /// Row-major homography from query to reference pixels (of the model's input), scaled to h33 = 1; left as it is
-    /// where h33 is 0 (the horizon passes through the corner of the query).
+    /// Row-major homography from query to reference pixels (of the model's input), scaled to h33 =
+    /// 1; left as it is where h33 is 0 (the horizon passes through the corner of the query).
     pub homography: Option<[f64; 9]>,
 }
 
@@ -134,7 +164,8 @@ pub struct Ranked {
 /// What re-ranking made of the candidates.
 #[derive(Debug)]
 pub enum Reranked<E> {
-    /// All were scored: best first, ties in the global order. Candidates that failed to load are listed apart.
+    /// All were scored: best first, ties in the global order. Candidates that failed to load are
+    /// listed apart.
     Complete {
         /// Scored candidates.
         ranked: Vec<Ranked>,
@@ -175,32 +206,47 @@ impl Reranker {
     /// Scores one pair. Deterministic: the random samples are seeded from the pair's content.
     ///
     /// # Panics
-    /// Where the two were made by different models (descriptors of different lengths), or the parts of one contradict
-    /// each other.
+    /// Where the two were made by different models (descriptors of different lengths), or the parts
+    /// of one contradict each other.
     pub fn score(&self, query: &PackedPatches, reference: &PackedPatches) -> PairScore {
-        with_prepared(self.simd, query, |prepared| self.score_prepared(prepared, reference))
+        with_prepared(self.simd, query, |prepared| {
+            self.score_prepared(prepared, reference)
+        })
     }
 
     /// Scores one pair and keeps the evidence.
     ///
     /// # Panics
     /// As [`score`](Self::score).
-    pub fn explain(&self, query: &PackedPatches, reference: &PackedPatches) -> Vec<CombinationMatch> {
+    pub fn explain(
+        &self,
+        query: &PackedPatches,
+        reference: &PackedPatches,
+    ) -> Vec<CombinationMatch> {
         with_prepared(self.simd, query, |prepared| {
-            with_workspace(|workspace| workspace.explain(self.simd, &self.config, prepared, reference))
+            with_workspace(|workspace| {
+                workspace.explain(self.simd, &self.config, prepared, reference)
+            })
         })
     }
 
-    /// The homography that most of `correspondences` (`x, y` in query, `u, v` in reference pixels) agree with, row-major,
-    /// and how many do to within `tolerance_px`; `None` where no four of them make a proper quadrilateral in both images.
-    pub fn homography(&self, correspondences: &[[f32; 4]], tolerance_px: f32) -> Option<([f64; 9], u32)> {
-        with_workspace(|workspace| workspace.homography(self.simd, &self.config, correspondences, tolerance_px))
+    /// The homography that most of `correspondences` (`x, y` in query, `u, v` in reference pixels)
+    /// agree with, row-major, and how many do to within `tolerance_px`; `None` where no four of
+    /// them make a proper quadrilateral in both images.
+    pub fn homography(
+        &self,
+        correspondences: &[[f32; 4]],
+        tolerance_px: f32,
+    ) -> Option<([f64; 9], u32)> {
+        with_workspace(|workspace| {
+            workspace.homography(self.simd, &self.config, correspondences, tolerance_px)
+        })
     }
 
     /// Scores `count` candidates in parallel, loading each through `load`.
     ///
-    /// Runs on the rayon pool it is called in. Once the deadline has passed no further candidate is begun. A candidate
-    /// takes about a millisecond, so the answer is late by no more than that.
+    /// Runs on the rayon pool it is called in. Once the deadline has passed no further candidate is
+    /// begun. A candidate takes about a millisecond, so the answer is late by no more than that.
     ///
     /// # Panics
     /// As [`score`](Self::score).
@@ -219,23 +265,28 @@ impl Reranker {
         if late() {
             return Reranked::DeadlinePassed;
         }
-        let outcomes: Option<Vec<Result<PairScore, E>>> = with_prepared(self.simd, query, |prepared| {
-            let one = |candidate: usize| {
-                if late() {
-                    return None;
-                }
-                let reference = match load(candidate) {
-                    Ok(reference) => reference,
-                    Err(error) => return Some(Err(error)),
+        let outcomes: Option<Vec<Result<PairScore, E>>> =
+            with_prepared(self.simd, query, |prepared| {
+                let one = |candidate: usize| {
+                    if late() {
+                        return None;
+                    }
+                    let reference = match load(candidate) {
+                        Ok(reference) => reference,
+                        Err(error) => return Some(Err(error)),
+                    };
+                    if late() {
+                        return None;
+                    }
+                    Some(Ok(self.score_prepared(prepared, &reference)))
                 };
-                if late() {
-                    return None;
-                }
-                Some(Ok(self.score_prepared(prepared, &reference)))
-            };
-            // Candidates differ in cost, so every one may be stolen.
-            (0..count).into_par_iter().with_max_len(1).map(one).collect()
-        });
+                // Candidates differ in cost, so every one may be stolen.
+                (0..count)
+                    .into_par_iter()
+                    .with_max_len(1)
+                    .map(one)
+                    .collect()
+            });
         match outcomes {
             Some(outcomes) => in_order(outcomes),
             None => Reranked::DeadlinePassed,

@@ -1,8 +1,9 @@
 //! Mutual nearest neighbours of two images' key patches (paper III-D, step 6).
 //!
-//! Descriptors are L2-normalised, so the nearest by Euclidean distance is the one of the largest dot product. The
-//! similarity of each pair of scales is computed once ([`crate::kernels::similarity`]), however many of the
-//! configured unions contain it; a union then takes the best over its blocks.
+//! Descriptors are L2-normalised, so the nearest by Euclidean distance is the one of the largest
+//! dot product. The similarity of each pair of scales is computed once
+//! ([`crate::kernels::similarity`]), however many of the configured unions contain it; a union then
+//! takes the best over its blocks.
 
 use crate::kernels::Simd;
 use crate::kernels::similarity::{self, Best, BlockMaxima, Blocks, PackedColumns, Quantised};
@@ -22,7 +23,11 @@ pub(super) struct PreparedQuery {
 
 impl PreparedQuery {
     pub(super) fn new(simd: Simd) -> Self {
-        Self { columns: PackedColumns::new(simd), counts: [0; SCALES], centres: Vec::new() }
+        Self {
+            columns: PackedColumns::new(simd),
+            counts: [0; SCALES],
+            centres: Vec::new(),
+        }
     }
 
     pub(super) fn simd(&self) -> Simd {
@@ -41,12 +46,21 @@ impl PreparedQuery {
 pub(super) fn centres_of(patches: &PackedPatches, out: &mut Vec<[f32; 2]>) {
     out.clear();
     for scale in 1..=SCALES {
-        out.extend(patches.rows(scale).map(|row| patches.grid.centre(scale, patches.index[row] as usize)));
+        out.extend(
+            patches
+                .rows(scale)
+                .map(|row| patches.grid.centre(scale, patches.index[row] as usize)),
+        );
     }
 }
 
 fn quantised(patches: &PackedPatches) -> Quantised<'_> {
-    Quantised { dim: patches.dim, counts: patches.counts, codes: &patches.codes, factors: &patches.factor }
+    Quantised {
+        dim: patches.dim,
+        counts: patches.counts,
+        codes: &patches.codes,
+        factors: &patches.factor,
+    }
 }
 
 /// Working memory of one thread.
@@ -58,12 +72,24 @@ pub(super) struct Matcher {
 
 impl Matcher {
     /// Computes the best partners within every pair of scales that `combinations` need.
-    pub(super) fn compare(&mut self, query: &PreparedQuery, reference: &PackedPatches, combinations: &[ScaleSet]) {
+    pub(super) fn compare(
+        &mut self,
+        query: &PreparedQuery,
+        reference: &PackedPatches,
+        combinations: &[ScaleSet],
+    ) {
         let wanted = blocks_of(combinations);
-        similarity::block_maxima(&query.columns, quantised(reference), &wanted, &mut self.scratch, &mut self.maxima);
+        similarity::block_maxima(
+            &query.columns,
+            quantised(reference),
+            &wanted,
+            &mut self.scratch,
+            &mut self.maxima,
+        );
     }
 
-    /// The mutual pairs of one union, ascending by query row, from the last comparison, which must have covered it.
+    /// The mutual pairs of one union, ascending by query row, from the last comparison, which must
+    /// have covered it.
     pub(super) fn mutual_pairs(
         &self,
         query: &PreparedQuery,
@@ -88,11 +114,16 @@ impl Matcher {
 
 /// The pairs of scales that occur together in some union.
 fn blocks_of(combinations: &[ScaleSet]) -> Blocks {
-    let together = |a: usize, b: usize| combinations.iter().any(|set| set.contains(a) && set.contains(b));
+    let together = |a: usize, b: usize| {
+        combinations
+            .iter()
+            .any(|set| set.contains(a) && set.contains(b))
+    };
     std::array::from_fn(|a| std::array::from_fn(|b| together(a + 1, b + 1)))
 }
 
-/// The best partner of `row` among the scales of a union; scales ascend, so a tie goes to the lowest index.
+/// The best partner of `row` among the scales of a union; scales ascend, so a tie goes to the
+/// lowest index.
 fn best_over(bests: &[Vec<Best>; SCALES], scales: ScaleSet, row: usize) -> Best {
     let mut best = Best::NONE;
     for scale in scales.scales() {

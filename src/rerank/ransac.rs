@@ -1,30 +1,34 @@
-//! The homography most correspondences agree with (paper III-D, step 7): RANSAC with local optimisation.
+//! The homography most correspondences agree with (paper III-D, step 7): RANSAC with local
+//! optimisation.
 //!
-//! Samples of four are drawn and screened many at a time; those that could be corners of one plane are gathered, solved
-//! and scored on all correspondences. Whenever one beats the best so far, least squares on the correspondences near it
-//! tries to gain more. The search stops once a sample free of outliers, had the best share of inliers been the true
-//! one, would have been drawn with the confidence asked for.
+//! Samples of four are drawn and screened many at a time; those that could be corners of one plane
+//! are gathered, solved and scored on all correspondences. Whenever one beats the best so far,
+//! least squares on the correspondences near it tries to gain more. The search stops once a sample
+//! free of outliers, had the best share of inliers been the true one, would have been drawn with
+//! the confidence asked for.
 //!
-//! Correspondences are sorted and the generator is seeded from their coordinates, so a pair's outcome depends on its
-//! content alone: not on time, threads, machine, or the order of the correspondences.
+//! Correspondences are sorted and the generator is seeded from their coordinates, so a pair's
+//! outcome depends on its content alone: not on time, threads, machine, or the order of the
+//! correspondences.
 
 use super::refine::refit;
 use crate::kernels::Simd;
 use crate::kernels::homography::{self, Hypotheses, LANES, PointPairs, Sample, Sampler};
 
-/// A sample's triangles must be larger than this, in squared tolerances (twice the area). On a grid of patches 2/3 of
-/// the tolerance apart the smallest proper triangle has 0.11 (half-patch offsets) to 0.44.
+/// A sample's triangles must be larger than this, in squared tolerances (twice the area). On a grid
+/// of patches 2/3 of the tolerance apart the smallest proper triangle has 0.11 (half-patch offsets)
+/// to 0.44.
 const MIN_AREA: f32 = 0.05;
 
-/// Samples drawn for every homography that may be scored: among false matches about one sample in eight keeps its
-/// orientation.
+/// Samples drawn for every homography that may be scored: among false matches about one sample in
+/// eight keeps its orientation.
 const DRAWS_PER_HOMOGRAPHY: usize = 8;
 
 /// Samples drawn and screened at once.
 const CHUNK: usize = 4 * LANES;
 
-/// Whether to go on is asked before every so many samples. Scores depend on it, and on it alone: not on how many are
-/// drawn or solved at once.
+/// Whether to go on is asked before every so many samples. Scores depend on it, and on it alone:
+/// not on how many are drawn or solved at once.
 const ROUND: usize = 8;
 
 /// Settings of the search.
@@ -55,8 +59,9 @@ pub(super) struct Ransac {
 }
 
 impl Ransac {
-    /// Finds the homography of `correspondences` (`x, y` in query, `u, v` in reference pixels); `None` where there are
-    /// fewer than four, or no four of them make a proper quadrilateral in both images.
+    /// Finds the homography of `correspondences` (`x, y` in query, `u, v` in reference pixels);
+    /// `None` where there are fewer than four, or no four of them make a proper quadrilateral in
+    /// both images.
     pub(super) fn estimate(
         &mut self,
         simd: Simd,
@@ -70,22 +75,33 @@ impl Ransac {
         }
         self.sorted.sort_unstable_by_key(key);
         let frame = Frame::of(&self.sorted, f64::from(settings.tolerance_px));
-        self.points.fill(self.sorted.iter().map(|&pair| frame.normalise(pair)));
-        let mut search = Search { simd, points: &self.points, best: 0, homography: None };
+        self.points
+            .fill(self.sorted.iter().map(|&pair| frame.normalise(pair)));
+        let mut search = Search {
+            simd,
+            points: &self.points,
+            best: 0,
+            homography: None,
+        };
         search.run(seed_of(&self.sorted), settings);
         let homography = frame.denormalise(&search.homography?);
         let near = |pair: &&[f32; 4]| is_inlier(&homography, **pair, settings.tolerance_px);
         let inliers = self.sorted.iter().filter(near).count() as u32;
-        Some(Estimate { homography, inliers })
+        Some(Estimate {
+            homography,
+            inliers,
+        })
     }
 }
 
 /// The bits of all coordinates in one number, so that one comparison orders two correspondences.
 fn key(pair: &[f32; 4]) -> u128 {
-    pair.iter().fold(0, |key, value| key << 32 | u128::from(value.to_bits()))
+    pair.iter()
+        .fold(0, |key, value| key << 32 | u128::from(value.to_bits()))
 }
 
-/// Whether the one-directional transfer error of a correspondence is within tolerance, with `w` strictly positive.
+/// Whether the one-directional transfer error of a correspondence is within tolerance, with `w`
+/// strictly positive.
 pub(super) fn is_inlier(homography: &[f64; 9], pair: [f32; 4], tolerance_px: f32) -> bool {
     let [a, b, c, d, e, f, g, h, i] = *homography;
     let [x, y, u, v] = pair.map(f64::from);
@@ -95,7 +111,8 @@ pub(super) fn is_inlier(homography: &[f64; 9], pair: [f32; 4], tolerance_px: f32
     w > 0.0 && dx * dx + dy * dy <= reach * reach
 }
 
-/// Coordinates with the origin at the correspondences' centre and the tolerance as unit, in both images.
+/// Coordinates with the origin at the correspondences' centre and the tolerance as unit, in both
+/// images.
 struct Frame {
     centre: [f64; 4],
     unit: f64,
@@ -105,9 +122,15 @@ impl Frame {
     fn of(correspondences: &[[f32; 4]], unit: f64) -> Self {
         let mut centre = [0.0; 4];
         for pair in correspondences {
-            centre.iter_mut().zip(pair).for_each(|(sum, &value)| *sum += f64::from(value));
+            centre
+                .iter_mut()
+                .zip(pair)
+                .for_each(|(sum, &value)| *sum += f64::from(value));
         }
-        Self { centre: centre.map(|sum| sum / correspondences.len() as f64), unit }
+        Self {
+            centre: centre.map(|sum| sum / correspondences.len() as f64),
+            unit,
+        }
     }
 
     fn normalise(&self, pair: [f32; 4]) -> [f32; 4] {
@@ -133,9 +156,12 @@ impl Frame {
 
 /// FNV-1a over the coordinates.
 fn seed_of(sorted: &[[f32; 4]]) -> u64 {
-    sorted.iter().flatten().fold(0xcbf2_9ce4_8422_2325, |hash: u64, value| {
-        (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0000_0100_0000_01b3)
-    })
+    sorted
+        .iter()
+        .flatten()
+        .fold(0xcbf2_9ce4_8422_2325, |hash: u64, value| {
+            (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0000_0100_0000_01b3)
+        })
 }
 
 /// How far a search has come.
@@ -164,7 +190,11 @@ struct Gathered {
 impl Default for Gathered {
     fn default() -> Self {
         // What is not filled is solved along with the rest, and must name pairs that are there.
-        Self { samples: [[0; 4]; CHUNK], numbers: [0; CHUNK], len: 0 }
+        Self {
+            samples: [[0; 4]; CHUNK],
+            numbers: [0; CHUNK],
+            len: 0,
+        }
     }
 }
 
@@ -178,7 +208,8 @@ impl Gathered {
                 let lane = bits.trailing_zeros() as usize;
                 bits &= bits - 1;
                 // Below CHUNK, which fits.
-                (self.samples[self.len], self.numbers[self.len]) = (sixteen[lane], (group * LANES + lane) as u8);
+                (self.samples[self.len], self.numbers[self.len]) =
+                    (sixteen[lane], (group * LANES + lane) as u8);
                 self.len += 1;
             }
         }
@@ -206,7 +237,11 @@ impl Search<'_> {
     fn run(&mut self, seed: u64, settings: &RansacSettings) {
         let mut sampler = Sampler::new(seed);
         let most_scored = settings.max_iterations as usize;
-        let mut progress = Progress { scored: 0, most_scored, needed: most_scored * DRAWS_PER_HOMOGRAPHY };
+        let mut progress = Progress {
+            scored: 0,
+            most_scored,
+            needed: most_scored * DRAWS_PER_HOMOGRAPHY,
+        };
         let (mut samples, mut proper) = ([[0; 4]; CHUNK], Gathered::default());
         for drawn in (0..).step_by(CHUNK) {
             if !progress.goes_on(drawn) {
@@ -220,7 +255,8 @@ impl Search<'_> {
         }
     }
 
-    /// Scores the samples gathered from a chunk, the first of which was number `drawn`; false once the search is over.
+    /// Scores the samples gathered from a chunk, the first of which was number `drawn`; false once
+    /// the search is over.
     fn try_samples(
         &mut self,
         proper: &Gathered,
@@ -268,10 +304,16 @@ impl Search<'_> {
     /// Refits on what lies within a shrinking reach, taking whatever gains inliers.
     fn improve(&mut self, mut homography: [f64; 9]) {
         for radius in LOCAL_RADII {
-            let Some(refined) = refit(self.points, &homography, radius) else { return };
+            let Some(refined) = refit(self.points, &homography, radius) else {
+                return;
+            };
             homography = refined;
-            let count =
-                homography::count_inliers(self.simd, self.points, &homography.map(|entry| entry as f32), self.best);
+            let count = homography::count_inliers(
+                self.simd,
+                self.points,
+                &homography.map(|entry| entry as f32),
+                self.best,
+            );
             if count > self.best {
                 self.take(homography, count);
             }

@@ -1,16 +1,17 @@
 //! Least-squares refinement of a homography on the correspondences near it.
 //!
-//! A homography through four patch centres inherits their quantisation to the patch grid. Fitting all correspondences
-//! within reach evens that out, and usually gains inliers. The algebraic residuals are divided by the previous
-//! estimate's `w`, which makes them the transfer error that inliers are judged by.
+//! A homography through four patch centres inherits their quantisation to the patch grid. Fitting
+//! all correspondences within reach evens that out, and usually gains inliers. The algebraic
+//! residuals are divided by the previous estimate's `w`, which makes them the transfer error that
+//! inliers are judged by.
 
 use crate::kernels::homography::PointPairs;
 use nalgebra::{SMatrix, SVector};
 
 /// Fits the correspondences whose transfer error under `homography` is within `radius` tolerances.
 ///
-/// Row-major, last entry 1 on return. `None` where fewer than five are in reach, or they do not determine a
-/// homography that keeps orientation and has the origin (their common centre) in front.
+/// Row-major, last entry 1 on return. `None` where fewer than five are in reach, or they do not
+/// determine a homography that keeps orientation and has the origin (their common centre) in front.
 pub(super) fn refit(pairs: &PointPairs, homography: &[f64; 9], radius: f64) -> Option<[f64; 9]> {
     let mut sums = Sums::default();
     for i in 0..pairs.len() {
@@ -19,10 +20,15 @@ pub(super) fn refit(pairs: &PointPairs, homography: &[f64; 9], radius: f64) -> O
             sums.add(pair, 1.0 / (w * w));
         }
     }
-    if sums.count < 5 { None } else { sums.solve().filter(keeps_orientation) }
+    if sums.count < 5 {
+        None
+    } else {
+        sums.solve().filter(keeps_orientation)
+    }
 }
 
-/// The `w` of a correspondence under `homography` (scaled to a last entry of 1) if its error is within `radius`.
+/// The `w` of a correspondence under `homography` (scaled to a last entry of 1) if its error is
+/// within `radius`.
 fn reach(homography: &[f64; 9], [x, y, u, v]: [f64; 4], radius: f64) -> Option<f64> {
     let [a, b, c, d, e, f, g, h, i] = *homography;
     let w = g * x + h * y + i;
@@ -48,11 +54,15 @@ impl Sums {
         self.count += 1;
         let monomials = [x * x, x * y, y * y, x, y, 1.0].map(|monomial| weight * monomial);
         for (moments, factor) in self.moments.iter_mut().zip([1.0, u, v, u * u + v * v]) {
-            moments.iter_mut().zip(monomials).for_each(|(moment, monomial)| *moment += factor * monomial);
+            moments
+                .iter_mut()
+                .zip(monomials)
+                .for_each(|(moment, monomial)| *moment += factor * monomial);
         }
     }
 
-    /// Minimises the weighted residuals of `a x + b y + c - u (g x + h y) = u` and its like for `v`.
+    /// Minimises the weighted residuals of `a x + b y + c - u (g x + h y) = u` and its like for
+    /// `v`.
     fn solve(&self) -> Option<[f64; 9]> {
         let [plain, by_u, by_v, by_square] = &self.moments;
         // Positions of the products of x, y and 1 within a row of moments.
@@ -80,7 +90,10 @@ impl Sums {
         }
         let solution = normal.cholesky()?.solve(&right);
         let homography = std::array::from_fn(|i| if i < 8 { solution[i] } else { 1.0 });
-        homography.iter().all(|entry| entry.is_finite()).then_some(homography)
+        homography
+            .iter()
+            .all(|entry| entry.is_finite())
+            .then_some(homography)
     }
 }
 
@@ -96,7 +109,13 @@ mod tests {
             let (x, y) = ((i % 8) as f64 * 4.0 - 14.0, (i / 8) as f64 * 3.0 - 11.0);
             let at = |row: usize| TRUE[row] * x + TRUE[row + 1] * y + TRUE[row + 2];
             let wobble = |k: f64| noise * (i as f64 * k).sin();
-            [x, y, at(0) / at(6) + wobble(1.7), at(3) / at(6) + wobble(2.9)].map(|value| value as f32)
+            [
+                x,
+                y,
+                at(0) / at(6) + wobble(1.7),
+                at(3) / at(6) + wobble(2.9),
+            ]
+            .map(|value| value as f32)
         }));
         pairs
     }
@@ -104,11 +123,23 @@ mod tests {
     #[test]
     fn the_truth_is_a_fixed_point_and_noise_is_evened_out() {
         let exact = refit(&grid(0.0), &TRUE, 1.0).unwrap();
-        assert!(exact.iter().zip(TRUE).all(|(ours, truth)| (ours - truth).abs() < 1e-4), "{exact:?}");
+        assert!(
+            exact
+                .iter()
+                .zip(TRUE)
+                .all(|(ours, truth)| (ours - truth).abs() < 1e-4),
+            "{exact:?}"
+        );
         let mut start = TRUE;
         start[2] += 0.3;
         let noisy = refit(&grid(0.3), &start, 1.0).unwrap();
-        assert!(noisy.iter().zip(TRUE).all(|(ours, truth)| (ours - truth).abs() < 0.1), "{noisy:?}");
+        assert!(
+            noisy
+                .iter()
+                .zip(TRUE)
+                .all(|(ours, truth)| (ours - truth).abs() < 0.1),
+            "{noisy:?}"
+        );
     }
 
     #[test]

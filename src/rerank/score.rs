@@ -1,4 +1,5 @@
-//! The score of a pair of images (paper III-E, step 8): S adds up the inliers of every configured union of scales.
+//! The score of a pair of images (paper III-E, step 8): S adds up the inliers of every configured
+//! union of scales.
 
 use super::mutual_nn::{Matcher, Pair, PreparedQuery, centres_of};
 use super::ransac::{Estimate, Ransac, RansacSettings, is_inlier};
@@ -28,8 +29,13 @@ pub(super) fn with_workspace<T>(work: impl FnOnce(&mut Workspace) -> T) -> T {
 
 /// Prepares `query` in memory this thread kept from an earlier one, and lends it.
 ///
-/// The memory is taken out meanwhile: while `work` waits for other threads, this one may be given another query.
-pub(super) fn with_prepared<T>(simd: Simd, query: &PackedPatches, work: impl FnOnce(&PreparedQuery) -> T) -> T {
+/// The memory is taken out meanwhile: while `work` waits for other threads, this one may be given
+/// another query.
+pub(super) fn with_prepared<T>(
+    simd: Simd,
+    query: &PackedPatches,
+    work: impl FnOnce(&PreparedQuery) -> T,
+) -> T {
     let kept = PREPARED.with_borrow_mut(|kept| kept.pop_if(|kept| kept.simd() == simd));
     let mut prepared = kept.unwrap_or_else(|| PreparedQuery::new(simd));
     prepared.prepare(query);
@@ -57,7 +63,13 @@ impl Workspace {
             let (score, _) = self.verify(simd, config, query, reference, scales);
             combinations.push(score);
         }
-        PairScore { spatial_score: combinations.iter().map(|combination| combination.inliers).sum(), combinations }
+        PairScore {
+            spatial_score: combinations
+                .iter()
+                .map(|combination| combination.inliers)
+                .sum(),
+            combinations,
+        }
     }
 
     /// Scores one reference and keeps who matched whom.
@@ -75,8 +87,9 @@ impl Workspace {
             let correspondences = self.pairs.iter().map(|&pair| Correspondence {
                 query: pair.0,
                 reference: pair.1,
-                inlier: estimate
-                    .is_some_and(|found| is_inlier(&found.homography, self.points(query, pair), tolerance_px)),
+                inlier: estimate.is_some_and(|found| {
+                    is_inlier(&found.homography, self.points(query, pair), tolerance_px)
+                }),
             });
             CombinationMatch {
                 score,
@@ -95,9 +108,19 @@ impl Workspace {
         correspondences: &[[f32; 4]],
         tolerance_px: f32,
     ) -> Option<([f64; 9], u32)> {
-        let RerankConfig { max_iterations, confidence, .. } = *config;
-        let settings = RansacSettings { tolerance_px, max_iterations, confidence };
-        let estimate = self.ransac.estimate(simd, correspondences.iter().copied(), &settings)?;
+        let RerankConfig {
+            max_iterations,
+            confidence,
+            ..
+        } = *config;
+        let settings = RansacSettings {
+            tolerance_px,
+            max_iterations,
+            confidence,
+        };
+        let estimate = self
+            .ransac
+            .estimate(simd, correspondences.iter().copied(), &settings)?;
         Some((scaled(estimate.homography), estimate.inliers))
     }
 
@@ -115,17 +138,32 @@ impl Workspace {
         reference: &PackedPatches,
         scales: ScaleSet,
     ) -> (CombinationScore, Option<Estimate>) {
-        self.matcher.mutual_pairs(query, reference, scales, &mut self.pairs);
+        self.matcher
+            .mutual_pairs(query, reference, scales, &mut self.pairs);
         let settings = RansacSettings {
             tolerance_px: tolerance_px(config, reference),
             max_iterations: config.max_iterations,
             confidence: config.confidence,
         };
-        let Self { ransac, pairs, centres, .. } = self;
-        let points = pairs.iter().map(|&pair| points_of(&query.centres, centres, pair));
+        let Self {
+            ransac,
+            pairs,
+            centres,
+            ..
+        } = self;
+        let points = pairs
+            .iter()
+            .map(|&pair| points_of(&query.centres, centres, pair));
         let estimate = ransac.estimate(simd, points, &settings);
         let inliers = estimate.map_or(0, |found| found.inliers);
-        (CombinationScore { scales, matches: self.pairs.len() as u32, inliers }, estimate)
+        (
+            CombinationScore {
+                scales,
+                matches: self.pairs.len() as u32,
+                inliers,
+            },
+            estimate,
+        )
     }
 
     fn points(&self, query: &PreparedQuery, pair: Pair) -> [f32; 4] {
@@ -147,5 +185,9 @@ fn tolerance_px(config: &RerankConfig, reference: &PackedPatches) -> f32 {
 /// Scaled to a last entry of 1 where that is possible.
 fn scaled(homography: [f64; 9]) -> [f64; 9] {
     let last = homography[8];
-    if last == 0.0 { homography } else { homography.map(|entry| entry / last) }
+    if last == 0.0 {
+        homography
+    } else {
+        homography.map(|entry| entry / last)
+    }
 }

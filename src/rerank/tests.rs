@@ -9,16 +9,26 @@ use crate::types::{KeyPatches, PatchGrid, PoolingStride, ScaleKeyPatches};
 use proptest::prelude::*;
 use std::path::Path;
 
-const SETTINGS: RansacSettings = RansacSettings { tolerance_px: 21.0, max_iterations: 2000, confidence: 0.995 };
+const SETTINGS: RansacSettings = RansacSettings {
+    tolerance_px: 21.0,
+    max_iterations: 2000,
+    confidence: 0.995,
+};
 
 /// A file of the reference's outputs; see the README beside it.
 fn golden(name: &str) -> Vec<u8> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden").join(name);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("tests/golden")
+        .join(name);
     std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
 fn floats(tensor: &safetensors::tensor::TensorView<'_>) -> Vec<f32> {
-    tensor.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
+    tensor
+        .data()
+        .chunks_exact(4)
+        .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
+        .collect()
 }
 
 /// Key patches of the default path; descriptors only where the file has all of them.
@@ -26,18 +36,40 @@ fn golden_patches(image: &str, [width, height]: [u16; 2]) -> (Vec<Vec<[f32; 2]>>
     let bytes = golden(&format!("{image}_{width}x{height}.safetensors"));
     let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     let tensor = |scale: usize, name: &str| file.tensor(&format!("exit8_key{scale}_{name}"));
-    let grid = PatchGrid { columns: width / 14, rows: height / 14, patch_px: 14, stride: PoolingStride::Kernel };
+    let grid = PatchGrid {
+        columns: width / 14,
+        rows: height / 14,
+        patch_px: 14,
+        stride: PoolingStride::Kernel,
+    };
     let scale = |scale: usize| {
         let index = tensor(scale, "index").unwrap();
         ScaleKeyPatches {
-            index: index.data().chunks_exact(8).map(|b| i64::from_le_bytes(b.try_into().unwrap()) as u32).collect(),
+            index: index
+                .data()
+                .chunks_exact(8)
+                .map(|b| i64::from_le_bytes(b.try_into().unwrap()) as u32)
+                .collect(),
             attention: floats(&tensor(scale, "attention").unwrap()),
-            descriptors: tensor(scale, "descriptor").map(|t| floats(&t)).unwrap_or_default(),
+            descriptors: tensor(scale, "descriptor")
+                .map(|t| floats(&t))
+                .unwrap_or_default(),
         }
     };
-    let centres =
-        [1, 2, 3].map(|s| floats(&tensor(s, "centre_xy").unwrap()).chunks_exact(2).map(|c| [c[0], c[1]]).collect());
-    (centres.into(), KeyPatches { grid, dim: 384, scales: [scale(1), scale(2), scale(3)] })
+    let centres = [1, 2, 3].map(|s| {
+        floats(&tensor(s, "centre_xy").unwrap())
+            .chunks_exact(2)
+            .map(|c| [c[0], c[1]])
+            .collect()
+    });
+    (
+        centres.into(),
+        KeyPatches {
+            grid,
+            dim: 384,
+            scales: [scale(1), scale(2), scale(3)],
+        },
+    )
 }
 
 #[derive(serde::Deserialize)]
@@ -90,7 +122,10 @@ fn golden_points(pair: &GoldenPair, scales: &str, golden: &GoldenScore) -> Vec<[
     let scales: ScaleSet = scales.parse().unwrap();
     let joined = |image: &str| -> Vec<[f32; 2]> {
         let (centres, _) = golden_patches(image, pair.size);
-        scales.scales().flat_map(|s| centres[s - 1].clone()).collect()
+        scales
+            .scales()
+            .flat_map(|s| centres[s - 1].clone())
+            .collect()
     };
     let (query, reference) = (joined(&pair.query), joined(&pair.reference));
     let point = |&[q, r]: &[usize; 2]| [query[q][0], query[q][1], reference[r][0], reference[r][1]];
@@ -100,7 +135,8 @@ fn golden_points(pair: &GoldenPair, scales: &str, golden: &GoldenScore) -> Vec<[
 /// Where `street_a` must land in `street_a_dusk`, in pixels of a `width` x `height` input.
 fn true_homography([width, height]: [u16; 2]) -> [f64; 9] {
     let bytes = golden("homography.json");
-    let all: std::collections::BTreeMap<String, [[f64; 3]; 3]> = serde_json::from_slice(&bytes).unwrap();
+    let all: std::collections::BTreeMap<String, [[f64; 3]; 3]> =
+        serde_json::from_slice(&bytes).unwrap();
     let at_640x480 = all["a_to_a_dusk_640x480"];
     let scale = [f64::from(width) / 640.0, f64::from(height) / 480.0, 1.0];
     std::array::from_fn(|i| at_640x480[i / 3][i % 3] * scale[i / 3] / scale[i % 3])
@@ -112,7 +148,9 @@ fn truth_of(pair: &GoldenPair) -> Option<[f64; 9]> {
     match (&*pair.query, &*pair.reference) {
         ("street_a", "street_a_dusk") => Some(there),
         ("street_a_dusk", "street_a") => {
-            let back = nalgebra::Matrix3::from_row_slice(&there).try_inverse().unwrap();
+            let back = nalgebra::Matrix3::from_row_slice(&there)
+                .try_inverse()
+                .unwrap();
             Some(std::array::from_fn(|i| back[(i / 3, i % 3)]))
         }
         ("street_a", "street_a") => Some([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
@@ -130,7 +168,8 @@ fn mean_deviation(found: &[f64; 9], truth: &[f64; 9], points: &[[f64; 2]]) -> f6
 }
 
 fn project(homography: &[f64; 9], [x, y]: [f64; 2]) -> [f64; 2] {
-    let [u, v, w] = [0, 3, 6].map(|row| homography[row] * x + homography[row + 1] * y + homography[row + 2]);
+    let [u, v, w] =
+        [0, 3, 6].map(|row| homography[row] * x + homography[row + 1] * y + homography[row + 2]);
     [u / w, v / w]
 }
 
@@ -138,7 +177,9 @@ fn project(homography: &[f64; 9], [x, y]: [f64; 2]) -> [f64; 2] {
 fn homographies_of_golden_matches_agree_with_the_true_one_both_ways_and_at_both_sizes() {
     let mut compared = 0;
     for pair in golden_pairs() {
-        let Some(truth) = truth_of(&pair) else { continue };
+        let Some(truth) = truth_of(&pair) else {
+            continue;
+        };
         for (scales, golden) in &pair.scores {
             let points = golden_points(&pair, scales, golden);
             let found = estimate(&points).unwrap().homography;
@@ -152,7 +193,10 @@ fn homographies_of_golden_matches_agree_with_the_true_one_both_ways_and_at_both_
                 .map(|[x, y, ..]| [x, y])
                 .collect();
             let mean = mean_deviation(&found, &truth, &inliers);
-            println!("{} {} {:?} {scales}: {mean:.2} px from the truth", pair.query, pair.reference, pair.size);
+            println!(
+                "{} {} {:?} {scales}: {mean:.2} px from the truth",
+                pair.query, pair.reference, pair.size
+            );
             assert!(mean < 14.0, "more than a patch from the truth: {mean}");
             compared += 1;
         }
@@ -164,8 +208,13 @@ fn homographies_of_golden_matches_agree_with_the_true_one_both_ways_and_at_both_
 fn explained_homographies_agree_with_the_true_one() {
     let mut compared = 0;
     // Only at this size are there all descriptors.
-    for pair in golden_pairs().into_iter().filter(|pair| pair.size == [448, 336]) {
-        let Some(truth) = truth_of(&pair) else { continue };
+    for pair in golden_pairs()
+        .into_iter()
+        .filter(|pair| pair.size == [448, 336])
+    {
+        let Some(truth) = truth_of(&pair) else {
+            continue;
+        };
         let patches = |name: &str| PackedPatches::quantise(&golden_patches(name, pair.size).1);
         let (query, reference) = (patches(&pair.query), patches(&pair.reference));
         for combination in Reranker::new(RerankConfig::default()).explain(&query, &reference) {
@@ -179,7 +228,10 @@ fn explained_homographies_agree_with_the_true_one() {
                 .collect();
             assert_eq!(inliers.len() as u32, combination.score.inliers);
             let mean = mean_deviation(&found, &truth, &inliers);
-            println!("{} {} {}: {mean:.2} px", pair.query, pair.reference, combination.score.scales);
+            println!(
+                "{} {} {}: {mean:.2} px",
+                pair.query, pair.reference, combination.score.scales
+            );
             assert!(mean < 14.0, "more than a patch from the truth: {mean}");
             compared += 1;
         }
@@ -187,49 +239,87 @@ fn explained_homographies_agree_with_the_true_one() {
     assert_eq!(compared, 9);
 }
 
-/// Mutual nearest neighbours as the paper writes them: f32 descriptors, Euclidean distance, lowest index on a tie.
+/// Mutual nearest neighbours as the paper writes them: f32 descriptors, Euclidean distance, lowest
+/// index on a tie.
 fn plain_mutual_pairs(query: &[f32], reference: &[f32], dim: usize) -> Vec<[usize; 2]> {
-    let (query, reference): (Vec<_>, Vec<_>) =
-        (query.chunks_exact(dim).collect(), reference.chunks_exact(dim).collect());
-    let distance = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>();
+    let (query, reference): (Vec<_>, Vec<_>) = (
+        query.chunks_exact(dim).collect(),
+        reference.chunks_exact(dim).collect(),
+    );
+    let distance = |a: &[f32], b: &[f32]| {
+        a.iter()
+            .zip(b)
+            .map(|(a, b)| f64::from(a - b).powi(2))
+            .sum::<f64>()
+    };
     let nearest = |from: &[f32], among: &[&[f32]]| {
         let distances: Vec<f64> = among.iter().map(|to| distance(from, to)).collect();
         (0..among.len()).min_by(|&i, &j| distances[i].total_cmp(&distances[j]).then(i.cmp(&j)))
     };
     let back: Vec<_> = reference.iter().map(|r| nearest(r, &query)).collect();
-    let mutual = |q: usize| nearest(query[q], &reference).filter(|&r| back[r] == Some(q)).map(|r| [q, r]);
+    let mutual = |q: usize| {
+        nearest(query[q], &reference)
+            .filter(|&r| back[r] == Some(q))
+            .map(|r| [q, r])
+    };
     (0..query.len()).filter_map(mutual).collect()
 }
 
 #[test]
 fn golden_descriptors_have_the_golden_mutual_pairs() {
     let (mut agree, mut total) = (0, 0);
-    for pair in golden_pairs().into_iter().filter(|pair| pair.size == [448, 336]) {
-        let ((_, query), (_, reference)) =
-            (golden_patches(&pair.query, pair.size), golden_patches(&pair.reference, pair.size));
-        let (packed_query, packed_reference) = (PackedPatches::quantise(&query), PackedPatches::quantise(&reference));
+    for pair in golden_pairs()
+        .into_iter()
+        .filter(|pair| pair.size == [448, 336])
+    {
+        let ((_, query), (_, reference)) = (
+            golden_patches(&pair.query, pair.size),
+            golden_patches(&pair.reference, pair.size),
+        );
+        let (packed_query, packed_reference) = (
+            PackedPatches::quantise(&query),
+            PackedPatches::quantise(&reference),
+        );
         for (name, golden) in &pair.scores {
             let scales: ScaleSet = name.parse().unwrap();
             let joined = |patches: &KeyPatches| -> Vec<f32> {
-                scales.scales().flat_map(|s| patches.scales[s - 1].descriptors.clone()).collect()
+                scales
+                    .scales()
+                    .flat_map(|s| patches.scales[s - 1].descriptors.clone())
+                    .collect()
             };
-            assert_eq!(plain_mutual_pairs(&joined(&query), &joined(&reference), 384), golden.mutual_pairs);
+            assert_eq!(
+                plain_mutual_pairs(&joined(&query), &joined(&reference), 384),
+                golden.mutual_pairs
+            );
             // Rows of a union of neighbouring scales count from its first scale.
-            let first = |patches: &PackedPatches| patches.rows(scales.scales().next().unwrap()).start;
+            let first =
+                |patches: &PackedPatches| patches.rows(scales.scales().next().unwrap()).start;
             let (q0, r0) = (first(&packed_query), first(&packed_reference));
             let int8: Vec<[usize; 2]> = mutual_pairs(&packed_query, &packed_reference, scales)
                 .into_iter()
                 .map(|(q, r)| [q as usize - q0, r as usize - r0])
                 .collect();
-            agree += golden.mutual_pairs.iter().filter(|pair| int8.contains(pair)).count();
+            agree += golden
+                .mutual_pairs
+                .iter()
+                .filter(|pair| int8.contains(pair))
+                .count();
             total += golden.mutual_pairs.len();
         }
     }
     println!("int8 finds {agree} of {total} mutual pairs of the reference");
-    assert!(total > 0 && agree as f64 > 0.97 * total as f64, "{agree} of {total}");
+    assert!(
+        total > 0 && agree as f64 > 0.97 * total as f64,
+        "{agree} of {total}"
+    );
 }
 
-fn mutual_pairs(query: &PackedPatches, reference: &PackedPatches, scales: ScaleSet) -> Vec<(u32, u32)> {
+fn mutual_pairs(
+    query: &PackedPatches,
+    reference: &PackedPatches,
+    scales: ScaleSet,
+) -> Vec<(u32, u32)> {
     let mut prepared = PreparedQuery::new(simd::selected());
     prepared.prepare(query);
     let (mut matcher, mut pairs) = (Matcher::default(), Vec::new());
@@ -243,7 +333,10 @@ struct Noise(u64);
 
 impl Noise {
     fn next(&mut self) -> u32 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        self.0 = self
+            .0
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 33) as u32
     }
 
@@ -256,7 +349,12 @@ impl Noise {
     }
 }
 
-const GRID: PatchGrid = PatchGrid { columns: 32, rows: 24, patch_px: 14, stride: PoolingStride::Kernel };
+const GRID: PatchGrid = PatchGrid {
+    columns: 32,
+    rows: 24,
+    patch_px: 14,
+    stride: PoolingStride::Kernel,
+};
 
 /// Patches at different places of the grid with random descriptors.
 fn random_patches(counts: [usize; 3], dim: usize, noise: &mut Noise) -> PackedPatches {
@@ -293,7 +391,10 @@ fn permuted(patches: &PackedPatches, noise: &mut Noise) -> (PackedPatches, Vec<u
     let moved = PackedPatches {
         index: order.iter().map(|&row| patches.index[row]).collect(),
         factor: order.iter().map(|&row| patches.factor[row]).collect(),
-        codes: order.iter().flat_map(|&row| patches.codes[row * patches.dim..][..patches.dim].to_vec()).collect(),
+        codes: order
+            .iter()
+            .flat_map(|&row| patches.codes[row * patches.dim..][..patches.dim].to_vec())
+            .collect(),
         ..patches.clone()
     };
     (moved, order)
@@ -305,7 +406,13 @@ fn counts() -> impl Strategy<Value = [usize; 3]> {
 
 fn scale_sets() -> impl Strategy<Value = ScaleSet> {
     (1u8..8).prop_map(|bits| {
-        ScaleSet::new(&[1, 2, 3].into_iter().filter(|s| bits >> (s - 1) & 1 == 1).collect::<Vec<_>>()).unwrap()
+        ScaleSet::new(
+            &[1, 2, 3]
+                .into_iter()
+                .filter(|s| bits >> (s - 1) & 1 == 1)
+                .collect::<Vec<_>>(),
+        )
+        .unwrap()
     })
 }
 
@@ -363,7 +470,8 @@ proptest! {
         prop_assert!(found.inliers as usize >= planted, "{} of {} planted among {}", found.inliers, planted, n);
         for [x, y] in [[100.0, 100.0], [350.0, 100.0], [350.0, 250.0], [100.0, 250.0]] {
             let ([u, v], [s, t]) = (project(&found.homography, [x, y]), project(&truth, [x, y]));
-            // An inlier lies within 21 px of its image under the one and within 7 px (5 px on each axis) under the other.
+            // An inlier lies within 21 px of its image under the one and within 7 px (5 px on each
+            // axis) under the other.
             prop_assert!((u - s).hypot(v - t) < 28.1, "({}, {}) instead of ({}, {})", u, v, s, t);
         }
     }
@@ -372,7 +480,8 @@ proptest! {
 /// `share` of `n` correspondences follow a homography to within 5 px, the others lie anywhere.
 fn planted(n: usize, share: f64, seed: u64) -> (Vec<[f32; 4]>, [f64; 9], usize) {
     let mut noise = Noise(seed);
-    let mut around = |middle: f64, spread: f64| middle + spread * (2.0 * f64::from(noise.unit()) - 1.0);
+    let mut around =
+        |middle: f64, spread: f64| middle + spread * (2.0 * f64::from(noise.unit()) - 1.0);
     let truth = [
         around(1.0, 0.2),
         around(0.0, 0.1),
@@ -402,13 +511,26 @@ fn planted(n: usize, share: f64, seed: u64) -> (Vec<[f32; 4]>, [f64; 9], usize) 
 
 #[test]
 fn degenerate_correspondences_are_survived() {
-    let line: Vec<[f32; 4]> =
-        (0..100).map(|i| [i as f32 * 4.0, i as f32 * 3.0, i as f32 * 4.0, i as f32 * 3.0]).collect();
+    let line: Vec<[f32; 4]> = (0..100)
+        .map(|i| {
+            [
+                i as f32 * 4.0,
+                i as f32 * 3.0,
+                i as f32 * 4.0,
+                i as f32 * 3.0,
+            ]
+        })
+        .collect();
     assert_eq!(estimate(&line), None);
     assert_eq!(estimate(&[[50.0, 60.0, 70.0, 80.0]; 200]), None);
     assert_eq!(estimate(&[]), None);
     assert_eq!(estimate(&line[..3]), None);
-    let square = [[7.0, 7.0, 7.0, 7.0], [77.0, 7.0, 77.0, 7.0], [77.0, 77.0, 77.0, 77.0], [7.0, 77.0, 7.0, 77.0]];
+    let square = [
+        [7.0, 7.0, 7.0, 7.0],
+        [77.0, 7.0, 77.0, 7.0],
+        [77.0, 77.0, 77.0, 77.0],
+        [7.0, 77.0, 7.0, 77.0],
+    ];
     assert_eq!(estimate(&square).unwrap().inliers, 4);
     // Each corner many times over: most samples repeat one.
     let repeated: Vec<_> = (0..200).map(|i| square[i % 4]).collect();
@@ -418,14 +540,23 @@ fn degenerate_correspondences_are_survived() {
     almost[0] = [300.0, 7.0, 300.0, 7.0];
     assert_eq!(estimate(&almost), None);
     // Everything lands in one spot.
-    let collapsed: Vec<_> = line.iter().enumerate().map(|(i, p)| [p[0], (i * i % 97) as f32, 100.0, 100.0]).collect();
+    let collapsed: Vec<_> = line
+        .iter()
+        .enumerate()
+        .map(|(i, p)| [p[0], (i * i % 97) as f32, 100.0, 100.0])
+        .collect();
     assert_eq!(estimate(&collapsed), None);
 }
 
 #[test]
 fn four_true_matches_among_four_hundred_false_ones_do_no_harm() {
     let (mut points, ..) = planted(400, 0.0, 3);
-    points.extend([[7.0, 7.0, 7.0, 7.0], [77.0, 7.0, 77.0, 7.0], [77.0, 77.0, 77.0, 77.0], [7.0, 77.0, 7.0, 77.0]]);
+    points.extend([
+        [7.0, 7.0, 7.0, 7.0],
+        [77.0, 7.0, 77.0, 7.0],
+        [77.0, 77.0, 77.0, 77.0],
+        [7.0, 77.0, 7.0, 77.0],
+    ]);
     let found = estimate(&points).unwrap();
     assert!((4..40).contains(&found.inliers), "{}", found.inliers);
 }
@@ -444,7 +575,10 @@ fn the_order_of_correspondences_does_not_matter() {
 fn an_image_matches_itself_completely() {
     let patches = random_patches([300, 120, 50], 384, &mut Noise(1));
     let score = Reranker::new(RerankConfig::default()).score(&patches, &patches);
-    assert!(score.combinations.iter().all(|c| c.matches == c.inliers), "{score:?}");
+    assert!(
+        score.combinations.iter().all(|c| c.matches == c.inliers),
+        "{score:?}"
+    );
     assert_eq!(score.spatial_score, 300 + 420 + 170);
 }
 
@@ -457,18 +591,29 @@ fn identical_descriptors_match_the_lowest_row_only() {
         let first = patches.rows(scales.scales().next().unwrap()).start as u32;
         assert_eq!(mutual_pairs(&patches, &patches, scales), [(first, first)]);
     }
-    assert_eq!(Reranker::new(RerankConfig::default()).score(&patches, &patches).spatial_score, 0);
+    assert_eq!(
+        Reranker::new(RerankConfig::default())
+            .score(&patches, &patches)
+            .spatial_score,
+        0
+    );
 }
 
 #[test]
 fn images_without_patches_score_nothing() {
-    let (none, some) = (random_patches([0; 3], 384, &mut Noise(1)), random_patches([50, 20, 5], 384, &mut Noise(2)));
+    let (none, some) = (
+        random_patches([0; 3], 384, &mut Noise(1)),
+        random_patches([50, 20, 5], 384, &mut Noise(2)),
+    );
     let reranker = Reranker::new(RerankConfig::default());
     for (query, reference) in [(&none, &some), (&some, &none), (&none, &none)] {
         let score = reranker.score(query, reference);
         assert_eq!((score.spatial_score, score.combinations.len()), (0, 3));
         assert!(
-            reranker.explain(query, reference).iter().all(|c| c.correspondences.is_empty() && c.homography.is_none())
+            reranker
+                .explain(query, reference)
+                .iter()
+                .all(|c| c.correspondences.is_empty() && c.homography.is_none())
         );
     }
 }
@@ -479,25 +624,36 @@ fn rerank_five(deadline: Option<Deadline>) -> Reranked<&'static str> {
     let load = |i: usize| match i {
         2 => Ok(std::sync::Arc::new(query.clone())),
         4 => Err("gone"),
-        _ => Ok(std::sync::Arc::new(random_patches([0; 3], 64, &mut Noise(2)))),
+        _ => Ok(std::sync::Arc::new(random_patches(
+            [0; 3],
+            64,
+            &mut Noise(2),
+        ))),
     };
     Reranker::new(RerankConfig::default()).rerank(&query, 5, load, deadline)
 }
 
 #[test]
 fn candidates_are_ranked_by_score_then_global_order_and_failures_listed() {
-    let Reranked::Complete { ranked, failed } = rerank_five(Some(Deadline::after(std::time::Duration::from_secs(600))))
+    let Reranked::Complete { ranked, failed } =
+        rerank_five(Some(Deadline::after(std::time::Duration::from_secs(600))))
     else {
         panic!("there was time")
     };
-    assert_eq!(ranked.iter().map(|r| r.candidate).collect::<Vec<_>>(), [2, 0, 1, 3]);
+    assert_eq!(
+        ranked.iter().map(|r| r.candidate).collect::<Vec<_>>(),
+        [2, 0, 1, 3]
+    );
     assert_eq!(ranked[0].score.spatial_score, 100 + 140 + 60);
     assert_eq!(failed, [(4, "gone")]);
 }
 
 #[test]
 fn a_passed_deadline_leaves_the_global_order() {
-    assert!(matches!(rerank_five(Some(Deadline::after(std::time::Duration::ZERO))), Reranked::DeadlinePassed));
+    assert!(matches!(
+        rerank_five(Some(Deadline::after(std::time::Duration::ZERO))),
+        Reranked::DeadlinePassed
+    ));
     assert!(matches!(rerank_five(None), Reranked::Complete { .. }));
 }
 
@@ -511,7 +667,8 @@ fn a_deadline_that_passes_midway_stops_the_loading() {
         std::thread::sleep(std::time::Duration::from_millis(40));
         Ok(Box::new(query.clone()))
     };
-    let reranked = Reranker::new(RerankConfig::default()).rerank(&query, 10_000, load, Some(deadline));
+    let reranked =
+        Reranker::new(RerankConfig::default()).rerank(&query, 10_000, load, Some(deadline));
     assert!(matches!(reranked, Reranked::DeadlinePassed));
     assert!(loads.into_inner() < 1000);
 }
@@ -519,6 +676,9 @@ fn a_deadline_that_passes_midway_stops_the_loading() {
 #[test]
 #[should_panic(expected = "different lengths")]
 fn descriptors_of_another_model_are_refused() {
-    let (a, b) = (random_patches([5; 3], 8, &mut Noise(1)), random_patches([5; 3], 16, &mut Noise(1)));
+    let (a, b) = (
+        random_patches([5; 3], 8, &mut Noise(1)),
+        random_patches([5; 3], 16, &mut Noise(1)),
+    );
     Reranker::new(RerankConfig::default()).score(&a, &b);
 }

@@ -11,7 +11,8 @@ const _: () = assert!(LENGTH == GLOBAL_DIM);
 /// References in a full block: a megabyte of codes, some 40 microseconds of scanning.
 #[cfg(not(test))]
 pub(super) const CAPACITY: usize = 4096;
-/// Small, so that unit tests pass many borders between blocks; tests of the public interface use the real one.
+/// Small, so that unit tests pass many borders between blocks; tests of the public interface use
+/// the real one.
 #[cfg(test)]
 pub(super) const CAPACITY: usize = 64;
 
@@ -32,7 +33,8 @@ impl Quantised {
     pub(super) fn new(vector: &[f32]) -> Self {
         let simd = simd::selected();
         let scale = quantise::largest(simd, vector) / 127.0;
-        // A factor that is zero, subnormal or not finite would make the codes meaningless: all is error then.
+        // A factor that is zero, subnormal or not finite would make the codes meaningless: all is
+        // error then.
         let scale = if scale.is_normal() { scale } else { 0.0 };
         let mut codes = [0; LENGTH];
         if scale != 0.0 {
@@ -40,7 +42,12 @@ impl Quantised {
         }
         let (missed, square) = quantise::squared_lengths(simd, vector, &codes, scale);
         let error = missed.sqrt();
-        Self { codes: Codes::new(codes), scale, error: (error * (1.0 + 1e-6)) as f32, square: square as f32 }
+        Self {
+            codes: Codes::new(codes),
+            scale,
+            error: (error * (1.0 + 1e-6)) as f32,
+            square: square as f32,
+        }
     }
 }
 
@@ -66,7 +73,9 @@ impl Block {
     pub(super) fn of(entries: impl IntoIterator<Item = IndexEntry>) -> Self {
         let mut block = Self::default();
         block.reserve();
-        entries.into_iter().for_each(|entry| block.push(&entry, Quantised::new(&entry.global)));
+        entries
+            .into_iter()
+            .for_each(|entry| block.push(&entry, Quantised::new(&entry.global)));
         block.fit();
         block
     }
@@ -77,8 +86,21 @@ impl Block {
 
     /// What a scan reads.
     pub(super) fn rows(&self) -> Rows<'_> {
-        let Self { codes, scales, errors, squares, longest, .. } = self;
-        Rows { codes, scales, errors, squares, longest: *longest }
+        let Self {
+            codes,
+            scales,
+            errors,
+            squares,
+            longest,
+            ..
+        } = self;
+        Rows {
+            codes,
+            scales,
+            errors,
+            squares,
+            longest: *longest,
+        }
     }
 
     /// Appends one reference, of which `quantised` is the vector.
@@ -95,7 +117,9 @@ impl Block {
         let place = PlaceAndTime::new(entry.location, entry.captured_at);
         self.places.push(place);
         self.extent.add(&place);
-        self.longest = self.longest.max(quantised.square.sqrt() * (1.0 + 1e-6) + quantised.error);
+        self.longest = self
+            .longest
+            .max(quantised.square.sqrt() * (1.0 + 1e-6) + quantised.error);
     }
 
     /// Appends a row of another block.
@@ -138,14 +162,18 @@ impl Block {
         order.sort_unstable_by_key(|&row| self.ids[row]);
         let mut sorted = Self::default();
         sorted.reserve();
-        order.into_iter().for_each(|row| sorted.push_row(&self, row));
+        order
+            .into_iter()
+            .for_each(|row| sorted.push_row(&self, row));
         sorted
     }
 
     /// Bytes on the heap.
     pub(super) fn memory_bytes(&self) -> usize {
-        let numbers =
-            self.scales.capacity() + self.errors.capacity() + self.squares.capacity() + self.vectors.capacity();
+        let numbers = self.scales.capacity()
+            + self.errors.capacity()
+            + self.squares.capacity()
+            + self.vectors.capacity();
         self.ids.capacity() * size_of::<ReferenceId>()
             + self.codes.capacity() * size_of::<Codes>()
             + self.places.capacity() * size_of::<PlaceAndTime>()
@@ -183,7 +211,8 @@ pub(super) struct Sealed {
     removed: Option<std::sync::Arc<[u64]>>,
     /// Rows that still count.
     pub live: usize,
-    /// The lowest and the highest id. Here rather than read from the block, which would have to be fetched for it.
+    /// The lowest and the highest id. Here rather than read from the block, which would have to be
+    /// fetched for it.
     pub range: (ReferenceId, ReferenceId),
 }
 
@@ -195,12 +224,19 @@ impl Sealed {
     pub(super) fn new(block: Block) -> Self {
         let block = block.sorted();
         let (live, range) = (block.len(), (block.ids[0], block.ids[block.len() - 1]));
-        Self { block: std::sync::Arc::new(block), removed: None, live, range }
+        Self {
+            block: std::sync::Arc::new(block),
+            removed: None,
+            live,
+            range,
+        }
     }
 
     /// Whether a row still counts.
     pub(super) fn is_live(&self, row: usize) -> bool {
-        self.removed.as_ref().is_none_or(|bits| bits[row / 64] >> (row % 64) & 1 == 0)
+        self.removed
+            .as_ref()
+            .is_none_or(|bits| bits[row / 64] >> (row % 64) & 1 == 0)
     }
 
     /// The row of a reference that still counts.
@@ -208,7 +244,11 @@ impl Sealed {
         if id < self.range.0 || id > self.range.1 {
             return None;
         }
-        self.block.ids.binary_search(&id).ok().filter(|&row| self.is_live(row))
+        self.block
+            .ids
+            .binary_search(&id)
+            .ok()
+            .filter(|&row| self.is_live(row))
     }
 
     /// Removes a row that counts. Searches that hold a clone of the block still see it.

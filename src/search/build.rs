@@ -1,8 +1,9 @@
 //! An index from references as a store gives them, one after another.
 //!
-//! Collecting a map first and building then would hold every vector twice and leave all threads but the reader's idle.
-//! Here references are packed into blocks while the next ones are read: whenever a block's worth has come, a thread of
-//! the rayon pool turns it into one. If the others do not keep up, the reader lends a hand instead of piling up more.
+//! Collecting a map first and building then would hold every vector twice and leave all threads but
+//! the reader's idle. Here references are packed into blocks while the next ones are read: whenever
+//! a block's worth has come, a thread of the rayon pool turns it into one. If the others do not
+//! keep up, the reader lends a hand instead of piling up more.
 
 use super::block::{Block, CAPACITY, Sealed};
 use super::list::BlockList;
@@ -18,8 +19,8 @@ const WAITING_PER_THREAD: usize = 2;
 #[derive(Default)]
 pub struct IndexBuilder {
     filling: Vec<IndexEntry>,
-    /// Those whose id is not above all before, which may replace an earlier one. The store's ids ascend, so that they
-    /// are few.
+    /// Those whose id is not above all before, which may replace an earlier one. The store's ids
+    /// ascend, so that they are few.
     late: Vec<IndexEntry>,
     highest: Option<ReferenceId>,
     /// Blocks handed to the pool, by their order.
@@ -82,7 +83,11 @@ impl IndexBuilder {
             let block = Sealed::new(Block::of(entries));
             lock(&sealed).push((number, block));
         };
-        if waiting < WAITING_PER_THREAD * rayon::current_num_threads() { rayon::spawn(pack) } else { pack() }
+        if waiting < WAITING_PER_THREAD * rayon::current_num_threads() {
+            rayon::spawn(pack)
+        } else {
+            pack()
+        }
     }
 }
 
@@ -98,9 +103,16 @@ mod tests {
     use proptest::prelude::*;
 
     fn entry(number: u64, value: u64) -> IndexEntry {
-        let global = (0..GLOBAL_DIM as u64).map(|i| ((value * 31 + i * i * 7) % 101) as f32 / 101.0).collect();
+        let global = (0..GLOBAL_DIM as u64)
+            .map(|i| ((value * 31 + i * i * 7) % 101) as f32 / 101.0)
+            .collect();
         let id = ReferenceId::from_bytes(u128::from(number).to_be_bytes());
-        IndexEntry { id, global, location: None, captured_at: None }
+        IndexEntry {
+            id,
+            global,
+            location: None,
+            captured_at: None,
+        }
     }
 
     fn same(a: &MapIndex, b: &MapIndex) {
@@ -108,14 +120,23 @@ mod tests {
         for value in 0..3 {
             let query = entry(0, 1000 + value).global;
             let filter = ReferenceFilter::default();
-            assert_eq!(a.search(&query, usize::MAX, &filter), b.search(&query, usize::MAX, &filter));
+            assert_eq!(
+                a.search(&query, usize::MAX, &filter),
+                b.search(&query, usize::MAX, &filter)
+            );
         }
     }
 
     fn built(entries: &[IndexEntry]) -> MapIndex {
         let mut builder = IndexBuilder::default();
-        entries.iter().cloned().for_each(|entry| builder.push(entry));
-        assert_eq!((builder.len(), builder.is_empty()), (entries.len(), entries.is_empty()));
+        entries
+            .iter()
+            .cloned()
+            .for_each(|entry| builder.push(entry));
+        assert_eq!(
+            (builder.len(), builder.is_empty()),
+            (entries.len(), entries.is_empty())
+        );
         builder.finish()
     }
 
@@ -135,8 +156,13 @@ mod tests {
 
     #[test]
     fn a_pool_of_one_thread_builds_from_within_and_from_without() {
-        let entries: Vec<_> = (0..20 * CAPACITY as u64 + 5).map(|number| entry(number, number)).collect();
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        let entries: Vec<_> = (0..20 * CAPACITY as u64 + 5)
+            .map(|number| entry(number, number))
+            .collect();
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(1)
+            .build()
+            .unwrap();
         let index = pool.install(|| built(&entries));
         same(&index, &built(&entries));
         // What was built goes on changing like any other.

@@ -1,13 +1,14 @@
 //! A query's filter, prepared so that most references are decided by a few comparisons.
 //!
-//! The exact test of a circle costs a dozen trigonometric calls. A circle lies inside a box of latitudes and
-//! longitudes that is known beforehand; whatever is outside the box is outside the circle, and so is a whole block of
-//! references whose own extent misses the box.
+//! The exact test of a circle costs a dozen trigonometric calls. A circle lies inside a box of
+//! latitudes and longitudes that is known beforehand; whatever is outside the box is outside the
+//! circle, and so is a whole block of references whose own extent misses the box.
 
 use crate::types::{GeoCircle, GeoPoint, ReferenceFilter};
 use time::OffsetDateTime;
 
-/// Smaller than any radius of the Earth in use, so that boxes come out too large rather than too small.
+/// Smaller than any radius of the Earth in use, so that boxes come out too large rather than too
+/// small.
 const SMALL_EARTH_RADIUS_M: f64 = 6_350_000.0;
 
 /// Degrees added on every side of a box against rounding: about 10 cm.
@@ -25,7 +26,11 @@ pub(super) struct PlaceAndTime {
 impl PlaceAndTime {
     pub(super) fn new(location: Option<GeoPoint>, captured_at: Option<OffsetDateTime>) -> Self {
         let (lat, lon) = location.map_or((f64::NAN, f64::NAN), |point| (point.lat(), point.lon()));
-        Self { lat, lon, captured_at }
+        Self {
+            lat,
+            lon,
+            captured_at,
+        }
     }
 
     fn location(&self) -> Option<GeoPoint> {
@@ -44,7 +49,11 @@ pub(super) struct Extent {
 impl Default for Extent {
     fn default() -> Self {
         let nothing = (f64::INFINITY, f64::NEG_INFINITY);
-        Self { lat: nothing, lon: nothing, captured_at: None }
+        Self {
+            lat: nothing,
+            lon: nothing,
+            captured_at: None,
+        }
     }
 }
 
@@ -79,10 +88,19 @@ impl Box2 {
         let half_lon = if south <= -90.0 || north >= 90.0 {
             180.0
         } else {
-            // The meridian that touches the circle; a circle clear of both poles spans less than a quarter turn.
-            (angle.sin() / lat.to_radians().cos()).min(1.0).asin().to_degrees() + MARGIN_DEGREES
+            // The meridian that touches the circle; a circle clear of both poles spans less than a
+            // quarter turn.
+            (angle.sin() / lat.to_radians().cos())
+                .min(1.0)
+                .asin()
+                .to_degrees()
+                + MARGIN_DEGREES
         };
-        Self { lat: (south, north), centre_lon, half_lon }
+        Self {
+            lat: (south, north),
+            centre_lon,
+            half_lon,
+        }
     }
 
     fn contains(&self, lat: f64, lon: f64) -> bool {
@@ -91,7 +109,10 @@ impl Box2 {
     }
 
     fn may_meet(&self, extent: &Extent) -> bool {
-        let (west, east) = (self.centre_lon - self.half_lon, self.centre_lon + self.half_lon);
+        let (west, east) = (
+            self.centre_lon - self.half_lon,
+            self.centre_lon + self.half_lon,
+        );
         let crosses_date_line = west < -180.0 || east > 180.0;
         let apart = extent.lon.1 < west || extent.lon.0 > east;
         extent.lat.1 >= self.lat.0 && extent.lat.0 <= self.lat.1 && (crosses_date_line || !apart)
@@ -107,7 +128,10 @@ pub(super) struct Sieve {
 
 impl Sieve {
     pub(super) fn new(filter: &ReferenceFilter) -> Self {
-        Self { filter: *filter, around: filter.near.as_ref().map(Box2::around) }
+        Self {
+            filter: *filter,
+            around: filter.near.as_ref().map(Box2::around),
+        }
     }
 
     /// Whether everything passes.
@@ -128,7 +152,8 @@ impl Sieve {
 
     /// Exactly [`ReferenceFilter::accepts`].
     pub(super) fn passes(&self, entry: &PlaceAndTime) -> bool {
-        self.around.is_none_or(|around| around.contains(entry.lat, entry.lon))
+        self.around
+            .is_none_or(|around| around.contains(entry.lat, entry.lon))
             && self.filter.accepts(entry.location(), entry.captured_at)
     }
 }
@@ -186,7 +211,10 @@ mod tests {
     #[test]
     fn far_blocks_are_skipped() {
         let circle = GeoCircle::new(GeoPoint::new(51.0, 7.0).unwrap(), 500.0).unwrap();
-        let sieve = Sieve::new(&ReferenceFilter { near: Some(circle), ..ReferenceFilter::default() });
+        let sieve = Sieve::new(&ReferenceFilter {
+            near: Some(circle),
+            ..ReferenceFilter::default()
+        });
         let mut extent = Extent::default();
         assert!(!sieve.may_pass(&extent));
         extent.add(&PlaceAndTime::new(GeoPoint::new(51.0, 7.1).ok(), None));

@@ -1,10 +1,11 @@
 //! The sealed blocks of a map: shared with searches, found by id, merged when they empty.
 //!
-//! A search holds on to what it scans, so whoever changes a block meanwhile must copy the list that names it. The list
-//! is therefore kept in groups, each behind its own pointer: taking a list copies one pointer for 64 blocks (a quarter
-//! of a million references), and a change copies one group at most. Groups and blocks know the range of their ids, so
-//! that looking one up reads hardly any block but its own; the store's ids ascend, which makes ranges mostly disjoint,
-//! but nothing relies on it.
+//! A search holds on to what it scans, so whoever changes a block meanwhile must copy the list that
+//! names it. The list is therefore kept in groups, each behind its own pointer: taking a list
+//! copies one pointer for 64 blocks (a quarter of a million references), and a change copies one
+//! group at most. Groups and blocks know the range of their ids, so that looking one up reads
+//! hardly any block but its own; the store's ids ascend, which makes ranges mostly disjoint, but
+//! nothing relies on it.
 
 use super::block::{Block, CAPACITY, Sealed};
 use crate::types::ReferenceId;
@@ -37,17 +38,32 @@ type Place = (usize, usize);
 
 impl Group {
     fn new(blocks: Vec<Sealed>) -> Self {
-        let first = blocks.iter().map(|block| block.range.0).min().unwrap_or(ReferenceId::from_bytes([0; 16]));
-        let last = blocks.iter().map(|block| block.range.1).max().unwrap_or(first);
+        let first = blocks
+            .iter()
+            .map(|block| block.range.0)
+            .min()
+            .unwrap_or(ReferenceId::from_bytes([0; 16]));
+        let last = blocks
+            .iter()
+            .map(|block| block.range.1)
+            .max()
+            .unwrap_or(first);
         let sparse = blocks.iter().filter(|block| is_sparse(block)).count();
-        Self { blocks, range: (first, last), sparse }
+        Self {
+            blocks,
+            range: (first, last),
+            sparse,
+        }
     }
 
     fn find(&self, id: ReferenceId) -> Option<(usize, usize)> {
         if id < self.range.0 || id > self.range.1 {
             return None;
         }
-        self.blocks.iter().enumerate().find_map(|(block, sealed)| Some((block, sealed.find(id)?)))
+        self.blocks
+            .iter()
+            .enumerate()
+            .find_map(|(block, sealed)| Some((block, sealed.find(id)?)))
     }
 }
 
@@ -61,7 +77,8 @@ impl BlockList {
         let mut list = Self::default();
         let mut blocks = blocks.into_iter().peekable();
         while blocks.peek().is_some() {
-            list.groups.push(Arc::new(Group::new(blocks.by_ref().take(GROUP).collect())));
+            list.groups
+                .push(Arc::new(Group::new(blocks.by_ref().take(GROUP).collect())));
         }
         list
     }
@@ -71,7 +88,10 @@ impl BlockList {
         match self.groups.last_mut() {
             Some(last) if last.blocks.len() < GROUP => {
                 let group = Arc::make_mut(last);
-                group.range = (group.range.0.min(sealed.range.0), group.range.1.max(sealed.range.1));
+                group.range = (
+                    group.range.0.min(sealed.range.0),
+                    group.range.1.max(sealed.range.1),
+                );
                 group.sparse += usize::from(is_sparse(&sealed));
                 group.blocks.push(sealed);
             }
@@ -81,7 +101,9 @@ impl BlockList {
 
     /// Above the number of every block, and the least such.
     pub(super) fn end(&self) -> usize {
-        self.groups.last().map_or(0, |last| (self.groups.len() - 1) * GROUP + last.blocks.len())
+        self.groups.last().map_or(0, |last| {
+            (self.groups.len() - 1) * GROUP + last.blocks.len()
+        })
     }
 
     /// The block of that number, if there is one.
@@ -105,7 +127,9 @@ impl BlockList {
 
     /// Removes a reference; false if none of that id counts.
     pub(super) fn remove(&mut self, id: ReferenceId) -> bool {
-        let Some((number, (block, row))) = self.find(id) else { return false };
+        let Some((number, (block, row))) = self.find(id) else {
+            return false;
+        };
         let group = Arc::make_mut(&mut self.groups[number]);
         let was_sparse = is_sparse(&group.blocks[block]);
         group.blocks[block].remove(row);
@@ -120,14 +144,19 @@ impl BlockList {
             let blocks: usize = group.blocks.iter().map(Sealed::memory_bytes).sum();
             blocks + group.blocks.capacity() * size_of::<Sealed>() + size_of::<Group>()
         };
-        self.groups.capacity() * size_of::<Arc<Group>>() + self.groups.iter().map(of_group).sum::<usize>()
+        self.groups.capacity() * size_of::<Arc<Group>>()
+            + self.groups.iter().map(of_group).sum::<usize>()
     }
 
     fn find(&self, id: ReferenceId) -> Option<(usize, (usize, usize))> {
-        self.groups.iter().enumerate().find_map(|(number, group)| Some((number, group.find(id)?)))
+        self.groups
+            .iter()
+            .enumerate()
+            .find_map(|(number, group)| Some((number, group.find(id)?)))
     }
 
-    /// Drops the block a row was removed from if it is empty, or merges it with another if both are at most half alive.
+    /// Drops the block a row was removed from if it is empty, or merges it with another if both are
+    /// at most half alive.
     fn compact(&mut self, place: Place) {
         let sealed = &self.groups[place.0].blocks[place.1];
         if sealed.live == 0 {
@@ -138,7 +167,10 @@ impl BlockList {
             let merged = sealed.merged(&self.groups[other.0].blocks[other.1]);
             let group = Arc::make_mut(&mut self.groups[place.0]);
             group.sparse -= usize::from(!is_sparse(&merged));
-            group.range = (group.range.0.min(merged.range.0), group.range.1.max(merged.range.1));
+            group.range = (
+                group.range.0.min(merged.range.0),
+                group.range.1.max(merged.range.1),
+            );
             group.blocks[place.1] = merged;
             self.take(other);
         }
@@ -152,13 +184,17 @@ impl BlockList {
             if group.sparse <= here {
                 return None;
             }
-            let other = |&block: &usize| (number, block) != place && is_sparse(&group.blocks[block]);
-            (0..group.blocks.len()).find(other).map(|block| (number, block))
+            let other =
+                |&block: &usize| (number, block) != place && is_sparse(&group.blocks[block]);
+            (0..group.blocks.len())
+                .find(other)
+                .map(|block| (number, block))
         };
         self.groups.iter().enumerate().find_map(within)
     }
 
-    /// Takes a sparse block out of the list, and merges its group with another if both are at most half full.
+    /// Takes a sparse block out of the list, and merges its group with another if both are at most
+    /// half full.
     fn take(&mut self, (number, block): Place) {
         let group = Arc::make_mut(&mut self.groups[number]);
         group.blocks.swap_remove(block);
@@ -167,9 +203,12 @@ impl BlockList {
         if group.blocks.is_empty() {
             self.groups.swap_remove(number);
         } else if small(group)
-            && let Some(other) = (0..self.groups.len()).find(|&other| other != number && small(&self.groups[other]))
+            && let Some(other) =
+                (0..self.groups.len()).find(|&other| other != number && small(&self.groups[other]))
         {
-            let both = [number, other].into_iter().flat_map(|number| self.groups[number].blocks.iter().cloned());
+            let both = [number, other]
+                .into_iter()
+                .flat_map(|number| self.groups[number].blocks.iter().cloned());
             self.groups[number] = Arc::new(Group::new(both.collect()));
             self.groups.swap_remove(other);
         }
@@ -198,7 +237,11 @@ mod tests {
 
     /// Blocks of consecutive ids.
     fn list(blocks: usize) -> BlockList {
-        BlockList::new((0..blocks).map(|block| sealed(block * CAPACITY..(block + 1) * CAPACITY)).collect())
+        BlockList::new(
+            (0..blocks)
+                .map(|block| sealed(block * CAPACITY..(block + 1) * CAPACITY))
+                .collect(),
+        )
     }
 
     fn check(list: &BlockList, there: impl Fn(usize) -> bool, end: usize) {
@@ -206,12 +249,26 @@ mod tests {
             let found = list.vector(id(number)).map(|vector| vector[0]);
             assert_eq!(found, there(number).then_some(number as f32), "{number}");
         }
-        let blocks: Vec<&Sealed> = (0..list.end()).filter_map(|number| list.get(number)).collect();
-        assert_eq!(blocks.iter().map(|block| block.live).sum::<usize>(), (0..end).filter(|&n| there(n)).count());
+        let blocks: Vec<&Sealed> = (0..list.end())
+            .filter_map(|number| list.get(number))
+            .collect();
+        assert_eq!(
+            blocks.iter().map(|block| block.live).sum::<usize>(),
+            (0..end).filter(|&n| there(n)).count()
+        );
         assert!(blocks.iter().filter(|block| is_sparse(block)).count() <= 1);
         let counted: usize = list.groups.iter().map(|group| group.sparse).sum();
-        assert_eq!(counted, blocks.iter().filter(|block| is_sparse(block)).count());
-        assert!(list.groups.iter().filter(|group| group.blocks.len() <= GROUP / 2).count() <= 1 + usize::from(end > 0));
+        assert_eq!(
+            counted,
+            blocks.iter().filter(|block| is_sparse(block)).count()
+        );
+        assert!(
+            list.groups
+                .iter()
+                .filter(|group| group.blocks.len() <= GROUP / 2)
+                .count()
+                <= 1 + usize::from(end > 0)
+        );
     }
 
     #[test]
@@ -227,7 +284,11 @@ mod tests {
                 assert!(!list.remove(id(number)));
             }
             removed.push(step);
-            check(&list, |n| !removed.iter().any(|&step| n.is_multiple_of(step)), end);
+            check(
+                &list,
+                |n| !removed.iter().any(|&step| n.is_multiple_of(step)),
+                end,
+            );
         }
         assert!(list.groups.is_empty());
     }
@@ -241,6 +302,9 @@ mod tests {
         assert!(before.vector(id(5)).is_some() && before.vector(id(9_000)).is_none());
         assert!(list.vector(id(5)).is_none() && list.vector(id(9_000)).is_some());
         // The group that did not change is still shared.
-        assert!(Arc::ptr_eq(&before.groups[1], &list.groups[1]) && !Arc::ptr_eq(&before.groups[0], &list.groups[0]));
+        assert!(
+            Arc::ptr_eq(&before.groups[1], &list.groups[1])
+                && !Arc::ptr_eq(&before.groups[0], &list.groups[0])
+        );
     }
 }

@@ -1,17 +1,20 @@
 //! Exact nearest neighbours among the global descriptors of one map.
 //!
-//! A query must see every reference of a map (an approximate index loses the very places that re-ranking would have
-//! saved), at a million references in milliseconds, while references come and go. The scan is limited by memory
-//! bandwidth, so it reads int8 codes, a quarter of the bytes; `scan.rs` proves why the result is exact nevertheless.
+//! A query must see every reference of a map (an approximate index loses the very places that
+//! re-ranking would have saved), at a million references in milliseconds, while references come and
+//! go. The scan is limited by memory bandwidth, so it reads int8 codes, a quarter of the bytes;
+//! `scan.rs` proves why the result is exact nevertheless.
 //!
-//! References live in blocks of 4096 (`block.rs`): sealed ones never change, so a search takes the list of them
-//! (`list.rs`) and scans without a lock while the index moves on; the youngest references are in one open block, the
-//! tail, which a search scans first, under a read lock of at most some 40 microseconds. Appending fills the tail, and
-//! sealing it moves it; an id above all before it, as the store's are, is not looked for. Removing copies a bitmap of 512
-//! bytes, and beside a search the names of 64 blocks. Two blocks that together fit into one are merged as soon as both
-//! are at most half alive, which costs each removal a constant share of one copy. So a search sees the index as it was
-//! at one instant, and nobody waits long for anyone. The order of the store's ids is the order of insertion, hence
-//! blocks are mostly sorted by themselves and their id ranges disjoint; neither is relied upon.
+//! References live in blocks of 4096 (`block.rs`): sealed ones never change, so a search takes the
+//! list of them (`list.rs`) and scans without a lock while the index moves on; the youngest
+//! references are in one open block, the tail, which a search scans first, under a read lock of at
+//! most some 40 microseconds. Appending fills the tail, and sealing it moves it; an id above all
+//! before it, as the store's are, is not looked for. Removing copies a bitmap of 512 bytes, and
+//! beside a search the names of 64 blocks. Two blocks that together fit into one are merged as soon
+//! as both are at most half alive, which costs each removal a constant share of one copy. So a
+//! search sees the index as it was at one instant, and nobody waits long for anyone. The order of
+//! the store's ids is the order of insertion, hence blocks are mostly sorted by themselves and
+//! their id ranges disjoint; neither is relied upon.
 
 mod block;
 mod build;
@@ -52,10 +55,12 @@ pub struct Neighbour {
     pub distance: f32,
 }
 
-/// Blocks scanned by one thread at a time at the least; fewer are not worth sending to another thread.
+/// Blocks scanned by one thread at a time at the least; fewer are not worth sending to another
+/// thread.
 const BLOCKS_PER_TASK: usize = 4;
 
-/// The global descriptors of one map in memory; searched and changed through `&self` from many threads.
+/// The global descriptors of one map in memory; searched and changed through `&self` from many
+/// threads.
 ///
 /// Takes about 1.35 kB per reference.
 #[derive(Default)]
@@ -95,15 +100,26 @@ impl MapIndex {
         });
         let (len, highest) = (entries.len(), entries.last().map(|entry| entry.id));
         let tail = Block::of(entries.drain(len - len % CAPACITY..));
-        let sealed: Vec<Sealed> =
-            entries.into_par_iter().chunks(CAPACITY).map(|chunk| Sealed::new(Block::of(chunk))).collect();
+        let sealed: Vec<Sealed> = entries
+            .into_par_iter()
+            .chunks(CAPACITY)
+            .map(|chunk| Sealed::new(Block::of(chunk)))
+            .collect();
         Self::of(BlockList::new(sealed), tail, highest, len)
     }
 
     /// An index of `len` references in sealed blocks and a tail.
     fn of(sealed: BlockList, tail: Block, highest: Option<ReferenceId>, len: usize) -> Self {
         let tail_rows = tail.ids.iter().copied().zip(0..).collect();
-        Self { state: RwLock::new(State { sealed, tail, tail_rows, highest, len }) }
+        Self {
+            state: RwLock::new(State {
+                sealed,
+                tail,
+                tail_rows,
+                highest,
+                len,
+            }),
+        }
     }
 
     /// Adds a reference, or replaces the one with its id.
@@ -125,7 +141,9 @@ impl MapIndex {
         state.len += 1;
         if state.tail.len() == CAPACITY {
             state.tail_rows.clear();
-            state.sealed.push(Sealed::new(std::mem::take(&mut state.tail)));
+            state
+                .sealed
+                .push(Sealed::new(std::mem::take(&mut state.tail)));
         }
     }
 
@@ -143,7 +161,8 @@ impl MapIndex {
         state.sealed.vector(id).map(<[f32]>::to_vec)
     }
 
-    /// The `k` nearest that pass `filter`, nearest first, ties by ascending id. Exact; see the module.
+    /// The `k` nearest that pass `filter`, nearest first, ties by ascending id. Exact; see the
+    /// module.
     ///
     /// # Panics
     /// If the query's length is not 256.
@@ -171,7 +190,10 @@ impl MapIndex {
         let part = if sealed.end() <= BLOCKS_PER_TASK {
             (0..sealed.end()).fold(Part::default(), scan)
         } else {
-            let parts = (0..sealed.end()).into_par_iter().with_min_len(BLOCKS_PER_TASK).fold(Part::default, scan);
+            let parts = (0..sealed.end())
+                .into_par_iter()
+                .with_min_len(BLOCKS_PER_TASK)
+                .fold(Part::default, scan);
             parts.reduce(Part::default, |a, b| a.joined(b, &query))
         };
         part.settle(&query, |number| sealed.block(number as usize), &mut top);
@@ -196,7 +218,8 @@ impl MapIndex {
         state.sealed.memory_bytes() + state.tail.memory_bytes() + rows
     }
 
-    // A panic while writing can only come from running out of memory; what is there stays consistent enough to read.
+    // A panic while writing can only come from running out of memory; what is there stays
+    // consistent enough to read.
     fn read(&self) -> RwLockReadGuard<'_, State> {
         self.state.read().unwrap_or_else(PoisonError::into_inner)
     }
@@ -207,7 +230,12 @@ impl MapIndex {
 }
 
 fn check(entry: &IndexEntry) {
-    assert_eq!(entry.global.len(), GLOBAL_DIM, "length of the descriptor of {}", entry.id);
+    assert_eq!(
+        entry.global.len(),
+        GLOBAL_DIM,
+        "length of the descriptor of {}",
+        entry.id
+    );
 }
 
 impl State {

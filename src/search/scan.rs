@@ -2,8 +2,8 @@
 //!
 //! # Why the result is exact
 //!
-//! Let q and x be the query and a reference, q' and x' what their codes say (code times scale, as real numbers), and
-//! eq >= |q - q'|, ex >= |x - x'| the stored errors. Then
+//! Let q and x be the query and a reference, q' and x' what their codes say (code times scale, as
+//! real numbers), and eq >= |q - q'|, ex >= |x - x'| the stored errors. Then
 //!
 //! ```text
 //! <q, x> - <q', x'>  =  <q, x - x'> + <q - q', x'>      so, by Cauchy-Schwarz,
@@ -11,20 +11,23 @@
 //! |q - x|^2 = |q|^2 + |x|^2 - 2 <q, x>  lies within  |q|^2 + |x|^2 - 2 <q', x'>  -+  2E
 //! ```
 //!
-//! `<q', x'>` is an integer dot product, exact in i32 and below 2^24 and hence exact in f32, times two scales. What is
-//! finally compared is not the real |q - x|^2 but D, its value summed in f32 as [`squared_distance`] does: 256 squares
-//! of rounded differences deviate from their real sum by at most 259 * 2^-24 of it, which with |q - x|^2 <= 2A, A =
+//! `<q', x'>` is an integer dot product, exact in i32 and below 2^24 and hence exact in f32, times
+//! two scales. What is finally compared is not the real |q - x|^2 but D, its value summed in f32 as
+//! [`squared_distance`] does: 256 squares of rounded differences deviate from their real sum by at
+//! most 259 * 2^-24 of it, which with |q - x|^2 <= 2A, A =
 //! |q|^2 + |x|^2, is below 2^-14 A. Evaluating the bound itself in f32 takes a dozen operations on numbers of at most
-//! about A: below 2^-19 A. Widening the bound by [`SLACK`] = 2^-13 of A on each side covers both, so
+//! about A: below 2^-19 A. Widening the bound by [`SLACK`] = 2^-13 of A on each side covers both,
+//! so
 //!
 //! ```text
 //! lower <= D <= upper    for every reference.
 //! ```
 //!
-//! If k references that pass the filter have `upper <= t`, the k-th smallest D is at most t, and a reference with
-//! `lower > t` is not among the k nearest, ties included. All others are kept and compared by D. Any t that held once
-//! holds on, so threads share the smallest found so far. Where a bound is not a number (lengths beyond f32), the
-//! comparison keeps the reference. Recall is 1 by construction; the bounds only decide how many are compared by D.
+//! If k references that pass the filter have `upper <= t`, the k-th smallest D is at most t, and a
+//! reference with `lower > t` is not among the k nearest, ties included. All others are kept and
+//! compared by D. Any t that held once holds on, so threads share the smallest found so far. Where
+//! a bound is not a number (lengths beyond f32), the comparison keeps the reference. Recall is 1 by
+//! construction; the bounds only decide how many are compared by D.
 
 use super::Neighbour;
 use super::block::{Block, Quantised, Sealed};
@@ -66,17 +69,37 @@ pub(super) struct Query<'a> {
     k: usize,
     sieve: Sieve,
     simd: Simd,
-    /// Bits of the smallest threshold found so far; as bits of positive floats they order like the floats.
+    /// Bits of the smallest threshold found so far; as bits of positive floats they order like the
+    /// floats.
     threshold: AtomicU32,
 }
 
 impl<'a> Query<'a> {
     pub(super) fn new(vector: &'a [f32], k: usize, sieve: Sieve) -> Self {
-        let Quantised { codes, scale, error, square } = Quantised::new(vector);
+        let Quantised {
+            codes,
+            scale,
+            error,
+            square,
+        } = Quantised::new(vector);
         let length = square.sqrt() * (1.0 + 1e-6);
-        let probe = Probe { codes, scale, square, length, error, slack: SLACK };
+        let probe = Probe {
+            codes,
+            scale,
+            square,
+            length,
+            error,
+            slack: SLACK,
+        };
         let threshold = AtomicU32::new(f32::INFINITY.to_bits());
-        Self { vector, probe, k, sieve, simd: simd::selected(), threshold }
+        Self {
+            vector,
+            probe,
+            k,
+            sieve,
+            simd: simd::selected(),
+            threshold,
+        }
     }
 
     fn threshold(&self) -> f32 {
@@ -84,7 +107,8 @@ impl<'a> Query<'a> {
     }
 
     fn lower_threshold(&self, to: f32) {
-        self.threshold.fetch_min(to.max(0.0).to_bits(), Ordering::Relaxed);
+        self.threshold
+            .fetch_min(to.max(0.0).to_bits(), Ordering::Relaxed);
     }
 }
 
@@ -139,7 +163,13 @@ impl Part {
     }
 
     /// Adds what may be near among the rows of a block that are `live`.
-    pub(super) fn scan_rows(&mut self, query: &Query<'_>, block: &Block, number: usize, live: impl Fn(usize) -> bool) {
+    pub(super) fn scan_rows(
+        &mut self,
+        query: &Query<'_>,
+        block: &Block,
+        number: usize,
+        live: impl Fn(usize) -> bool,
+    ) {
         if !query.sieve.is_open() && !query.sieve.may_pass(&block.extent) {
             return;
         }
@@ -148,18 +178,34 @@ impl Part {
         } else {
             CHOSEN.with_borrow_mut(|chosen| {
                 chosen.clear();
-                let passing = (0..block.len()).filter(|&row| live(row) && query.sieve.passes(&block.places[row]));
+                let passing = (0..block.len())
+                    .filter(|&row| live(row) && query.sieve.passes(&block.places[row]));
                 chosen.extend(passing.map(|row| row as u32));
-                chosen.iter().for_each(|&row| self.compare_one(query, block, number, row as usize));
+                chosen
+                    .iter()
+                    .for_each(|&row| self.compare_one(query, block, number, row as usize));
             });
         }
     }
 
-    fn compare_all(&mut self, query: &Query<'_>, block: &Block, number: usize, live: impl Fn(usize) -> bool) {
+    fn compare_all(
+        &mut self,
+        query: &Query<'_>,
+        block: &Block,
+        number: usize,
+        live: impl Fn(usize) -> bool,
+    ) {
         let rows = block.rows();
         let (mut from, mut found) = (0, Bounds::NONE);
         // Almost always no row of a group comes near.
-        while let Some(group) = next_near(query.simd, &query.probe, &rows, from, query.threshold(), &mut found) {
+        while let Some(group) = next_near(
+            query.simd,
+            &query.probe,
+            &rows,
+            from,
+            query.threshold(),
+            &mut found,
+        ) {
             for (row, (&lower, &upper)) in (group..).zip(found.lower.iter().zip(&found.upper)) {
                 if live(row) {
                     self.offer(query, number, row, lower, upper);
@@ -168,12 +214,18 @@ impl Part {
             from = group + GROUP;
         }
         let rest = block.len() - block.len() % GROUP..block.len();
-        rest.filter(|&row| live(row)).for_each(|row| self.compare_one(query, block, number, row));
+        rest.filter(|&row| live(row))
+            .for_each(|row| self.compare_one(query, block, number, row));
     }
 
     fn compare_one(&mut self, query: &Query<'_>, block: &Block, number: usize, row: usize) {
         let mut dot = [0];
-        dot_products(query.simd, &query.probe.codes, &block.codes[row..=row], &mut dot);
+        dot_products(
+            query.simd,
+            &query.probe.codes,
+            &block.codes[row..=row],
+            &mut dot,
+        );
         let (lower, upper) = bounds(&query.probe, &block.rows(), row, dot[0]);
         self.offer(query, number, row, lower, upper);
     }
@@ -183,12 +235,24 @@ impl Part {
             return;
         }
         // Bounds that are not numbers bound nothing.
-        let lower = if lower.is_nan() { f32::NEG_INFINITY } else { lower };
+        let lower = if lower.is_nan() {
+            f32::NEG_INFINITY
+        } else {
+            lower
+        };
         let upper = if upper.is_nan() { f32::INFINITY } else { upper };
-        self.candidates.push(Candidate { lower, block: block as u32, row: row as u32 });
+        self.candidates.push(Candidate {
+            lower,
+            block: block as u32,
+            row: row as u32,
+        });
         if self.uppers.len() < query.k {
             self.uppers.push(Ordered(upper));
-        } else if self.uppers.peek().is_some_and(|worst| Ordered(upper) < *worst) {
+        } else if self
+            .uppers
+            .peek()
+            .is_some_and(|worst| Ordered(upper) < *worst)
+        {
             self.uppers.pop();
             self.uppers.push(Ordered(upper));
         }
@@ -209,7 +273,8 @@ impl Part {
 
     /// Forgets candidates that a threshold found since excludes.
     fn prune(&mut self, threshold: f32) {
-        self.candidates.retain(|candidate| candidate.lower <= threshold);
+        self.candidates
+            .retain(|candidate| candidate.lower <= threshold);
         self.prune_at = self.candidates.len() * 2;
     }
 
@@ -231,16 +296,25 @@ impl Part {
     }
 
     /// Compares the candidates in full precision and puts the nearest into `top`.
-    pub(super) fn settle<'b>(mut self, query: &Query<'_>, block: impl Fn(u32) -> &'b Block, top: &mut Top) {
+    pub(super) fn settle<'b>(
+        mut self,
+        query: &Query<'_>,
+        block: impl Fn(u32) -> &'b Block,
+        top: &mut Top,
+    ) {
         self.prune(query.threshold());
-        self.candidates.sort_unstable_by(|a, b| a.lower.total_cmp(&b.lower));
+        self.candidates
+            .sort_unstable_by(|a, b| a.lower.total_cmp(&b.lower));
         for candidate in self.candidates {
             if top.worst().is_some_and(|worst| candidate.lower > worst) {
                 // All that follow are farther still.
                 return;
             }
             let (block, row) = (block(candidate.block), candidate.row as usize);
-            top.offer(squared_distance(query.vector, block.vector(row)), block.ids[row]);
+            top.offer(
+                squared_distance(query.vector, block.vector(row)),
+                block.ids[row],
+            );
         }
     }
 }
@@ -253,17 +327,31 @@ pub(super) struct Top {
 
 impl Top {
     pub(super) fn new(k: usize) -> Self {
-        Self { k, heap: BinaryHeap::new() }
+        Self {
+            k,
+            heap: BinaryHeap::new(),
+        }
     }
 
     /// The k-th smallest squared distance, once there are k.
     fn worst(&self) -> Option<f32> {
-        if self.heap.len() < self.k { None } else { self.heap.peek().map(|(worst, _)| worst.0) }
+        if self.heap.len() < self.k {
+            None
+        } else {
+            self.heap.peek().map(|(worst, _)| worst.0)
+        }
     }
 
     fn offer(&mut self, square: f32, id: ReferenceId) {
         // Only a query that is not made of numbers gets here with one.
-        let new = (Ordered(if square.is_nan() { f32::INFINITY } else { square }), id);
+        let new = (
+            Ordered(if square.is_nan() {
+                f32::INFINITY
+            } else {
+                square
+            }),
+            id,
+        );
         if self.heap.len() < self.k {
             self.heap.push(new);
         } else if self.heap.peek().is_some_and(|worst| new < *worst) {
@@ -282,6 +370,12 @@ impl Top {
     /// Nearest first, ties by ascending id.
     pub(super) fn into_neighbours(self) -> Vec<Neighbour> {
         let sorted = self.heap.into_sorted_vec();
-        sorted.into_iter().map(|(square, id)| Neighbour { id, distance: square.0.sqrt() }).collect()
+        sorted
+            .into_iter()
+            .map(|(square, id)| Neighbour {
+                id,
+                distance: square.0.sqrt(),
+            })
+            .collect()
     }
 }

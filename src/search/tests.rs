@@ -23,21 +23,40 @@ enum Kind {
     Long,
 }
 
-const KINDS: [Kind; 6] = [Kind::Unit, Kind::Clustered, Kind::Duplicate, Kind::Axis, Kind::Zero, Kind::Long];
+const KINDS: [Kind; 6] = [
+    Kind::Unit,
+    Kind::Clustered,
+    Kind::Duplicate,
+    Kind::Axis,
+    Kind::Zero,
+    Kind::Long,
+];
 
 fn vector(kind: Kind, seed: u64) -> Vec<f32> {
     let mut random = ChaCha8Rng::seed_from_u64(match kind {
         Kind::Duplicate => seed % 3,
         _ => seed,
     });
-    let mut noise = |scale: f32| -> Vec<f32> { (0..GLOBAL_DIM).map(|_| random.random_range(-scale..scale)).collect() };
+    let mut noise = |scale: f32| -> Vec<f32> {
+        (0..GLOBAL_DIM)
+            .map(|_| random.random_range(-scale..scale))
+            .collect()
+    };
     match kind {
         Kind::Unit | Kind::Duplicate => normalised(noise(1.0)),
         Kind::Clustered => {
             let centre = vector(Kind::Unit, seed % 5);
-            normalised(centre.iter().zip(noise(0.002)).map(|(c, n)| c + n).collect())
+            normalised(
+                centre
+                    .iter()
+                    .zip(noise(0.002))
+                    .map(|(c, n)| c + n)
+                    .collect(),
+            )
         }
-        Kind::Axis => (0..GLOBAL_DIM).map(|i| if i as u64 == seed % 256 { 1.0 } else { 0.0 }).collect(),
+        Kind::Axis => (0..GLOBAL_DIM)
+            .map(|i| if i as u64 == seed % 256 { 1.0 } else { 0.0 })
+            .collect(),
         Kind::Zero => vec![0.0; GLOBAL_DIM],
         Kind::Long => noise(10f32.powi((seed % 30) as i32 - 10)),
     }
@@ -52,8 +71,14 @@ fn entry(number: u64, kind: Kind, seed: u64) -> IndexEntry {
     let located = !seed.is_multiple_of(4);
     let location = located.then(|| GeoPoint::new(51.0 + (seed % 97) as f64 * 1e-3, 7.0).unwrap());
     let timed = !seed.is_multiple_of(5);
-    let captured_at = timed.then(|| OffsetDateTime::from_unix_timestamp((seed % 89) as i64).unwrap());
-    IndexEntry { id: id(number), global: vector(kind, seed), location, captured_at }
+    let captured_at =
+        timed.then(|| OffsetDateTime::from_unix_timestamp((seed % 89) as i64).unwrap());
+    IndexEntry {
+        id: id(number),
+        global: vector(kind, seed),
+        location,
+        captured_at,
+    }
 }
 
 fn brute_force<'a>(
@@ -68,7 +93,12 @@ fn brute_force<'a>(
         .collect();
     all.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     all.truncate(k);
-    all.into_iter().map(|(square, id)| Neighbour { id, distance: square.sqrt() }).collect()
+    all.into_iter()
+        .map(|(square, id)| Neighbour {
+            id,
+            distance: square.sqrt(),
+        })
+        .collect()
 }
 
 fn filters() -> Vec<ReferenceFilter> {
@@ -77,10 +107,25 @@ fn filters() -> Vec<ReferenceFilter> {
     let before = Some(OffsetDateTime::from_unix_timestamp(40).unwrap());
     vec![
         ReferenceFilter::default(),
-        ReferenceFilter { near, ..ReferenceFilter::default() },
-        ReferenceFilter { captured_after: after, captured_before: before, ..ReferenceFilter::default() },
-        ReferenceFilter { near, captured_after: after, captured_before: before },
-        ReferenceFilter { captured_after: before, captured_before: after, ..ReferenceFilter::default() },
+        ReferenceFilter {
+            near,
+            ..ReferenceFilter::default()
+        },
+        ReferenceFilter {
+            captured_after: after,
+            captured_before: before,
+            ..ReferenceFilter::default()
+        },
+        ReferenceFilter {
+            near,
+            captured_after: after,
+            captured_before: before,
+        },
+        ReferenceFilter {
+            captured_after: before,
+            captured_before: after,
+            ..ReferenceFilter::default()
+        },
     ]
 }
 
@@ -100,7 +145,9 @@ fn assert_exact(index: &MapIndex, entries: &[IndexEntry], query: &[f32]) {
 fn results_equal_a_plain_scan_for_every_kind_of_vector() {
     for kind in KINDS {
         for count in [0, 1, 63, 64, 65, 1000] {
-            let entries: Vec<_> = (0..count).map(|number| entry(number, kind, number)).collect();
+            let entries: Vec<_> = (0..count)
+                .map(|number| entry(number, kind, number))
+                .collect();
             let index = MapIndex::build(entries.clone());
             assert_eq!(index.len(), entries.len());
             for seed in 0..3 {
@@ -113,9 +160,14 @@ fn results_equal_a_plain_scan_for_every_kind_of_vector() {
 
 #[test]
 fn kinds_mixed_in_one_index_are_ranked_alike() {
-    let entries: Vec<_> = (0..1200).map(|number| entry(number, KINDS[number as usize % 6], number * 7)).collect();
+    let entries: Vec<_> = (0..1200)
+        .map(|number| entry(number, KINDS[number as usize % 6], number * 7))
+        .collect();
     let index = MapIndex::default();
-    entries.iter().rev().for_each(|entry| index.insert(entry.clone()));
+    entries
+        .iter()
+        .rev()
+        .for_each(|entry| index.insert(entry.clone()));
     for seed in 0..12 {
         assert_exact(&index, &entries, &vector(KINDS[seed % 6], seed as u64));
     }
@@ -123,21 +175,30 @@ fn kinds_mixed_in_one_index_are_ranked_alike() {
 
 #[test]
 fn vectors_beyond_f32_do_not_hide_the_others() {
-    let mut entries: Vec<_> = (0..300).map(|number| entry(number, Kind::Unit, number)).collect();
+    let mut entries: Vec<_> = (0..300)
+        .map(|number| entry(number, Kind::Unit, number))
+        .collect();
     for (number, entry) in entries.iter_mut().enumerate().step_by(3) {
-        entry.global.fill(if number % 2 == 0 { 3e38 } else { -1e25 });
+        entry
+            .global
+            .fill(if number % 2 == 0 { 3e38 } else { -1e25 });
     }
     let index = MapIndex::build(entries.clone());
     let query = vector(Kind::Unit, 9);
     let found = index.search(&query, 300, &ReferenceFilter::default());
-    assert_eq!(found, brute_force(entries.iter(), &query, 300, &ReferenceFilter::default()));
+    assert_eq!(
+        found,
+        brute_force(entries.iter(), &query, 300, &ReferenceFilter::default())
+    );
     let first = index.search(&query, 200, &ReferenceFilter::default());
     assert_eq!(first, found[..200]);
 }
 
 #[test]
 fn of_equal_ids_the_last_counts() {
-    let mut entries: Vec<_> = (0..200).map(|number| entry(number % 50, Kind::Unit, number)).collect();
+    let mut entries: Vec<_> = (0..200)
+        .map(|number| entry(number % 50, Kind::Unit, number))
+        .collect();
     let index = MapIndex::build(entries.clone());
     entries.drain(..150);
     assert_eq!(index.len(), 50);
@@ -204,8 +265,15 @@ proptest! {
 
 #[test]
 fn searches_beside_changes_see_each_reference_whole() {
-    let index = MapIndex::build((0..500).map(|number| entry(number, Kind::Unit, number)).collect());
-    let steady: Vec<_> = (0..500).step_by(2).map(|number| entry(number, Kind::Unit, number)).collect();
+    let index = MapIndex::build(
+        (0..500)
+            .map(|number| entry(number, Kind::Unit, number))
+            .collect(),
+    );
+    let steady: Vec<_> = (0..500)
+        .step_by(2)
+        .map(|number| entry(number, Kind::Unit, number))
+        .collect();
     std::thread::scope(|scope| {
         let changers: Vec<_> = (0..2u64)
             .map(|part| {
@@ -219,9 +287,12 @@ fn searches_beside_changes_see_each_reference_whole() {
                             }
                         }
                         // Replacing a reference by itself must never hide it.
-                        (0..500).step_by(2).filter(|n| n / 2 % 2 == part).for_each(|number| {
-                            index.insert(entry(number, Kind::Unit, number));
-                        });
+                        (0..500)
+                            .step_by(2)
+                            .filter(|n| n / 2 % 2 == part)
+                            .for_each(|number| {
+                                index.insert(entry(number, Kind::Unit, number));
+                            });
                     }
                 })
             })
@@ -232,8 +303,15 @@ fn searches_beside_changes_see_each_reference_whole() {
             let query = vector(Kind::Unit, round % 7);
             let found = index.search(&query, 600, &ReferenceFilter::default());
             assert!(found.is_sorted_by(|a, b| (a.distance, a.id) < (b.distance, b.id)));
-            let lasting: Vec<_> = found.iter().copied().filter(|n| steady.iter().any(|e| e.id == n.id)).collect();
-            assert_eq!(lasting, brute_force(steady.iter(), &query, 600, &ReferenceFilter::default()));
+            let lasting: Vec<_> = found
+                .iter()
+                .copied()
+                .filter(|n| steady.iter().any(|e| e.id == n.id))
+                .collect();
+            assert_eq!(
+                lasting,
+                brute_force(steady.iter(), &query, 600, &ReferenceFilter::default())
+            );
         }
     });
 }

@@ -1,7 +1,8 @@
 //! Key patches as bytes on disk.
 //!
-//! The blob is what makes a map large, so it holds int8 codes and grid positions instead of floats and coordinates;
-//! and it outlives releases, so it names its version and carries a checksum. All numbers are little-endian:
+//! The blob is what makes a map large, so it holds int8 codes and grid positions instead of floats
+//! and coordinates; and it outlives releases, so it names its version and carries a checksum. All
+//! numbers are little-endian:
 //!
 //! | offset | bytes | what |
 //! |---|---|---|
@@ -18,8 +19,9 @@
 //! | .. | n * length | codes, i8, row-major |
 //! | end - 4 | 4 | CRC-32 (IEEE) of all bytes before |
 //!
-//! Decoding checks the length that the counts imply against the bytes at hand before it allocates, then the
-//! checksum, then every value's range: whatever the bytes, the outcome is a valid [`PackedPatches`] or an error.
+//! Decoding checks the length that the counts imply against the bytes at hand before it allocates,
+//! then the checksum, then every value's range: whatever the bytes, the outcome is a valid
+//! [`PackedPatches`] or an error.
 
 use crate::types::{PackedPatches, PatchGrid, PoolingStride, SCALES};
 use half::f16;
@@ -64,7 +66,8 @@ pub enum CodecError {
 /// Writes `patches` as a blob; fails only on values that decoding would refuse.
 pub fn encode(patches: &PackedPatches) -> Result<Vec<u8>, CodecError> {
     check(patches)?;
-    let dim = u16::try_from(patches.dim).map_err(|_| CodecError::Value(format!("{} is too long", patches.dim)))?;
+    let dim = u16::try_from(patches.dim)
+        .map_err(|_| CodecError::Value(format!("{} is too long", patches.dim)))?;
     let mut bytes = Vec::with_capacity(HEADER + patches.len() * (8 + patches.dim) + TRAILER);
     bytes.extend_from_slice(&MAGIC);
     bytes.extend_from_slice(&VERSION.to_le_bytes());
@@ -73,7 +76,12 @@ pub fn encode(patches: &PackedPatches) -> Result<Vec<u8>, CodecError> {
         PoolingStride::One => 1,
     });
     bytes.push(0);
-    for value in [patches.grid.columns, patches.grid.rows, patches.grid.patch_px, dim] {
+    for value in [
+        patches.grid.columns,
+        patches.grid.rows,
+        patches.grid.patch_px,
+        dim,
+    ] {
         bytes.extend_from_slice(&value.to_le_bytes());
     }
     for count in patches.counts {
@@ -92,7 +100,10 @@ pub fn encode(patches: &PackedPatches) -> Result<Vec<u8>, CodecError> {
 /// Reads a blob back.
 pub fn decode(bytes: &[u8]) -> Result<PackedPatches, CodecError> {
     if bytes.len() < HEADER + TRAILER {
-        return Err(CodecError::Length { found: bytes.len(), expected: HEADER + TRAILER });
+        return Err(CodecError::Length {
+            found: bytes.len(),
+            expected: HEADER + TRAILER,
+        });
     }
     if bytes[..4] != MAGIC {
         return Err(CodecError::Magic);
@@ -107,12 +118,21 @@ pub fn decode(bytes: &[u8]) -> Result<PackedPatches, CodecError> {
     let total: usize = counts.iter().sum();
     let expected = HEADER + total * (8 + dim) + TRAILER;
     if bytes.len() != expected {
-        return Err(CodecError::Length { found: bytes.len(), expected });
+        return Err(CodecError::Length {
+            found: bytes.len(),
+            expected,
+        });
     }
-    let (content, stored) = (&bytes[..bytes.len() - TRAILER], trailing_checksum(bytes).unwrap_or_default());
+    let (content, stored) = (
+        &bytes[..bytes.len() - TRAILER],
+        trailing_checksum(bytes).unwrap_or_default(),
+    );
     let found = crc32fast::hash(content);
     if found != stored {
-        return Err(CodecError::Checksum { found, expected: stored });
+        return Err(CodecError::Checksum {
+            found,
+            expected: stored,
+        });
     }
     let stride = match (bytes[6], bytes[7]) {
         (0, 0) => PoolingStride::Kernel,
@@ -123,12 +143,32 @@ pub fn decode(bytes: &[u8]) -> Result<PackedPatches, CodecError> {
     let (attention, rest) = rest.split_at(total * 2);
     let (factor, codes) = rest.split_at(total * 4);
     let patches = PackedPatches {
-        grid: PatchGrid { columns: u16_at(bytes, 8), rows: u16_at(bytes, 10), patch_px: u16_at(bytes, 12), stride },
+        grid: PatchGrid {
+            columns: u16_at(bytes, 8),
+            rows: u16_at(bytes, 10),
+            patch_px: u16_at(bytes, 12),
+            stride,
+        },
         dim,
         counts,
-        index: index.as_chunks().0.iter().map(|b| u16::from_le_bytes(*b)).collect(),
-        attention: attention.as_chunks().0.iter().map(|b| f16::from_le_bytes(*b)).collect(),
-        factor: factor.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect(),
+        index: index
+            .as_chunks()
+            .0
+            .iter()
+            .map(|b| u16::from_le_bytes(*b))
+            .collect(),
+        attention: attention
+            .as_chunks()
+            .0
+            .iter()
+            .map(|b| f16::from_le_bytes(*b))
+            .collect(),
+        factor: factor
+            .as_chunks()
+            .0
+            .iter()
+            .map(|b| f32::from_le_bytes(*b))
+            .collect(),
         codes: bytemuck::cast_slice(codes).to_vec(),
     };
     check(&patches)?;
@@ -144,23 +184,47 @@ pub fn trailing_checksum(blob: &[u8]) -> Option<u32> {
 fn check(patches: &PackedPatches) -> Result<(), CodecError> {
     let wrong = |what: String| Err(CodecError::Value(what));
     let total = patches.len();
-    let lengths = [patches.index.len(), patches.attention.len(), patches.factor.len()];
+    let lengths = [
+        patches.index.len(),
+        patches.attention.len(),
+        patches.factor.len(),
+    ];
     if lengths.iter().any(|&length| length != total) || patches.codes.len() != total * patches.dim {
-        return wrong(format!("{total} patches with {lengths:?} values and {} codes", patches.codes.len()));
+        return wrong(format!(
+            "{total} patches with {lengths:?} values and {} codes",
+            patches.codes.len()
+        ));
     }
-    if patches.dim == 0 || patches.grid.columns == 0 || patches.grid.rows == 0 || patches.grid.patch_px == 0 {
-        return wrong(format!("an empty grid or descriptor: {:?}, length {}", patches.grid, patches.dim));
+    if patches.dim == 0
+        || patches.grid.columns == 0
+        || patches.grid.rows == 0
+        || patches.grid.patch_px == 0
+    {
+        return wrong(format!(
+            "an empty grid or descriptor: {:?}, length {}",
+            patches.grid, patches.dim
+        ));
     }
     for scale in 1..=SCALES {
         let (columns, rows) = patches.grid.pooled(scale);
-        if let Some(index) = patches.index[patches.rows(scale)].iter().find(|&&i| i as usize >= columns * rows) {
-            return wrong(format!("position {index} at scale {scale} of a {columns}x{rows} grid"));
+        if let Some(index) = patches.index[patches.rows(scale)]
+            .iter()
+            .find(|&&i| i as usize >= columns * rows)
+        {
+            return wrong(format!(
+                "position {index} at scale {scale} of a {columns}x{rows} grid"
+            ));
         }
         if patches.counts[scale - 1] > columns * rows {
-            return wrong(format!("{} patches at scale {scale} of {columns}x{rows}", patches.counts[scale - 1]));
+            return wrong(format!(
+                "{} patches at scale {scale} of {columns}x{rows}",
+                patches.counts[scale - 1]
+            ));
         }
     }
-    if !patches.attention.iter().all(|a| a.is_finite()) || !patches.factor.iter().all(|f| f.is_finite() && *f >= 0.0) {
+    if !patches.attention.iter().all(|a| a.is_finite())
+        || !patches.factor.iter().all(|f| f.is_finite() && *f >= 0.0)
+    {
         return wrong("an attention or factor is not a finite number".into());
     }
     if patches.codes.contains(&i8::MIN) {
@@ -183,7 +247,10 @@ pub fn decode_f32(bytes: &[u8]) -> Option<Vec<f32>> {
 
 /// A pooled vector as f16 bytes, rounded to nearest.
 pub fn encode_f16(values: &[f32]) -> Vec<u8> {
-    values.iter().flat_map(|v| f16::from_f32(*v).to_le_bytes()).collect()
+    values
+        .iter()
+        .flat_map(|v| f16::from_f32(*v).to_le_bytes())
+        .collect()
 }
 
 /// The inverse of [`encode_f16`], widened; `None` unless whole, finite numbers.
@@ -208,27 +275,48 @@ mod tests {
 
     fn patches() -> impl Strategy<Value = PackedPatches> {
         let grid = (3u16..40, 3u16..40, 1u16..32, any::<bool>());
-        (grid, 1usize..40, any::<u64>()).prop_map(|((columns, rows, patch_px, dense), dim, seed)| {
-            use rand::{RngExt, SeedableRng};
-            let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-            let stride = if dense { PoolingStride::One } else { PoolingStride::Kernel };
-            let grid = PatchGrid { columns, rows, patch_px, stride };
-            let cells = [1, 2, 3].map(|scale| grid.pooled(scale)).map(|(c, r)| c * r);
-            let counts = cells.map(|n| random.random_range(0..=n.min(20)));
-            let index: Vec<u16> = (0..3)
-                .flat_map(|s| (0..counts[s]).map(|_| random.random_range(0..cells[s]) as u16).collect::<Vec<_>>())
-                .collect();
-            let total = index.len();
-            PackedPatches {
-                grid,
-                dim,
-                counts,
-                index,
-                attention: (0..total).map(|_| f16::from_f32(random.random_range(0.0..9.0))).collect(),
-                factor: (0..total).map(|_| random.random_range(0.0..1.0)).collect(),
-                codes: (0..total * dim).map(|_| random.random_range(-127..=127)).collect(),
-            }
-        })
+        (grid, 1usize..40, any::<u64>()).prop_map(
+            |((columns, rows, patch_px, dense), dim, seed)| {
+                use rand::{RngExt, SeedableRng};
+                let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+                let stride = if dense {
+                    PoolingStride::One
+                } else {
+                    PoolingStride::Kernel
+                };
+                let grid = PatchGrid {
+                    columns,
+                    rows,
+                    patch_px,
+                    stride,
+                };
+                let cells = [1, 2, 3]
+                    .map(|scale| grid.pooled(scale))
+                    .map(|(c, r)| c * r);
+                let counts = cells.map(|n| random.random_range(0..=n.min(20)));
+                let index: Vec<u16> = (0..3)
+                    .flat_map(|s| {
+                        (0..counts[s])
+                            .map(|_| random.random_range(0..cells[s]) as u16)
+                            .collect::<Vec<_>>()
+                    })
+                    .collect();
+                let total = index.len();
+                PackedPatches {
+                    grid,
+                    dim,
+                    counts,
+                    index,
+                    attention: (0..total)
+                        .map(|_| f16::from_f32(random.random_range(0.0..9.0)))
+                        .collect(),
+                    factor: (0..total).map(|_| random.random_range(0.0..1.0)).collect(),
+                    codes: (0..total * dim)
+                        .map(|_| random.random_range(-127..=127))
+                        .collect(),
+                }
+            },
+        )
     }
 
     proptest! {
@@ -275,7 +363,12 @@ mod tests {
 
     fn golden() -> PackedPatches {
         PackedPatches {
-            grid: PatchGrid { columns: 4, rows: 3, patch_px: 14, stride: PoolingStride::Kernel },
+            grid: PatchGrid {
+                columns: 4,
+                rows: 3,
+                patch_px: 14,
+                stride: PoolingStride::Kernel,
+            },
             dim: 2,
             counts: [1, 1, 0],
             index: vec![11, 1],
@@ -289,8 +382,13 @@ mod tests {
     fn version_1_bytes_never_change() {
         let expected: Vec<u8> = [
             b"PFKP".as_slice(),
-            &[1, 0, 0, 0, 4, 0, 3, 0, 14, 0, 2, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0],
-            &[11, 0, 1, 0, 0x00, 0x3e, 0x00, 0x40, 0, 0, 0, 0x3f, 0, 0, 0x80, 0x3e, 127, 129, 1, 255],
+            &[
+                1, 0, 0, 0, 4, 0, 3, 0, 14, 0, 2, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0,
+            ],
+            &[
+                11, 0, 1, 0, 0x00, 0x3e, 0x00, 0x40, 0, 0, 0, 0x3f, 0, 0, 0x80, 0x3e, 127, 129, 1,
+                255,
+            ],
             &GOLDEN_CHECKSUM.to_le_bytes(),
         ]
         .concat();
@@ -322,7 +420,10 @@ mod tests {
         for breakage in breakages {
             let mut patches = golden();
             breakage(&mut patches);
-            assert!(matches!(encode(&patches), Err(CodecError::Value(_))), "{patches:?}");
+            assert!(
+                matches!(encode(&patches), Err(CodecError::Value(_))),
+                "{patches:?}"
+            );
         }
     }
 }

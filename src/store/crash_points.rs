@@ -1,8 +1,9 @@
 //! Named places at which the process can be made to die, for tests of durability.
 //!
-//! A store is only as good as its behaviour when the power goes between two writes. Tests therefore start the real
-//! process with `PLACEFORMER_CRASH_AT=name` or `name:nth` and it aborts, without unwinding or flushing anything,
-//! when that place is reached (for the nth time, counting from 1). Without the variable a place costs one load.
+//! A store is only as good as its behaviour when the power goes between two writes. Tests therefore
+//! start the real process with `PLACEFORMER_CRASH_AT=name` or `name:nth` and it aborts, without
+//! unwinding or flushing anything, when that place is reached (for the nth time, counting from 1).
+//! Without the variable a place costs one load.
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -28,8 +29,16 @@ pub const MID_REHEAD: &str = "mid_rehead";
 pub const MID_MIGRATION: &str = "mid_migration";
 
 /// Every crash point, for tests that walk through all.
-pub const ALL: &[&str] =
-    &[BEFORE_BEGIN, MID_INSERT, BEFORE_COMMIT, AFTER_COMMIT, MAP_DELETED, MID_PURGE, MID_REHEAD, MID_MIGRATION];
+pub const ALL: &[&str] = &[
+    BEFORE_BEGIN,
+    MID_INSERT,
+    BEFORE_COMMIT,
+    AFTER_COMMIT,
+    MAP_DELETED,
+    MID_PURGE,
+    MID_REHEAD,
+    MID_MIGRATION,
+];
 
 struct Armed {
     name: String,
@@ -38,12 +47,17 @@ struct Armed {
 
 fn armed() -> Option<&'static Armed> {
     static ARMED: OnceLock<Option<Armed>> = OnceLock::new();
-    ARMED.get_or_init(|| std::env::var(VARIABLE).ok().map(|setting| parse(&setting))).as_ref()
+    ARMED
+        .get_or_init(|| std::env::var(VARIABLE).ok().map(|setting| parse(&setting)))
+        .as_ref()
 }
 
 fn parse(setting: &str) -> Armed {
     let (name, nth) = setting.split_once(':').unwrap_or((setting, "1"));
-    Armed { name: name.to_owned(), left: AtomicU64::new(nth.parse().unwrap_or(1)) }
+    Armed {
+        name: name.to_owned(),
+        left: AtomicU64::new(nth.parse().unwrap_or(1)),
+    }
 }
 
 /// Dies here if this place is the armed one and its turn has come.
@@ -63,8 +77,14 @@ mod tests {
     #[test]
     fn settings_name_a_place_and_optionally_its_turn() {
         let first = parse("before_commit");
-        assert_eq!((first.name.as_str(), first.left.into_inner()), ("before_commit", 1));
+        assert_eq!(
+            (first.name.as_str(), first.left.into_inner()),
+            ("before_commit", 1)
+        );
         let third = parse("mid_purge:3");
-        assert_eq!((third.name.as_str(), third.left.into_inner()), ("mid_purge", 3));
+        assert_eq!(
+            (third.name.as_str(), third.left.into_inner()),
+            ("mid_purge", 3)
+        );
     }
 }

@@ -24,7 +24,9 @@ pub enum StoreError {
         id: ReferenceId,
     },
     /// The external id belongs to a reference with other content.
-    #[error("external id {external_id} of map {map} belongs to reference {existing}, which has other content")]
+    #[error(
+        "external id {external_id} of map {map} belongs to reference {existing}, which has other content"
+    )]
     ExternalIdConflict {
         /// The map.
         map: MapName,
@@ -54,7 +56,9 @@ pub enum StoreError {
         given: ModelId,
     },
     /// A reference fails its checksum; it is quarantined.
-    #[error("reference {id} is damaged on disk and quarantined: {reason}; delete it or send its image again")]
+    #[error(
+        "reference {id} is damaged on disk and quarantined: {reason}; delete it or send its image again"
+    )]
     Corrupt {
         /// Which.
         id: ReferenceId,
@@ -68,13 +72,17 @@ pub enum StoreError {
         map: String,
     },
     /// The head that a map keeps for itself fails its checksum.
-    #[error("the head that map {map} keeps is damaged on disk; give it a head again, its references are whole")]
+    #[error(
+        "the head that map {map} keeps is damaged on disk; give it a head again, its references are whole"
+    )]
     CorruptHead {
         /// The map.
         map: MapName,
     },
     /// A part of the database that belongs to no single record is damaged.
-    #[error("the database is damaged, noticed while {context}: {source}; check the stopped store, or restore a backup")]
+    #[error(
+        "the database is damaged, noticed while {context}: {source}; check the stopped store, or restore a backup"
+    )]
     Damaged {
         /// What was being done.
         context: &'static str,
@@ -99,7 +107,9 @@ pub enum StoreError {
         holder: String,
     },
     /// The database was written by a newer release.
-    #[error("the database has schema version {found}, this release knows up to {supported}: use a newer release")]
+    #[error(
+        "the database has schema version {found}, this release knows up to {supported}: use a newer release"
+    )]
     SchemaTooNew {
         /// Version on disk.
         found: i64,
@@ -107,7 +117,9 @@ pub enum StoreError {
         supported: i64,
     },
     /// A migration that was applied is not the one this release carries.
-    #[error("migration {version} was applied with other content than this release carries; the database is not ours")]
+    #[error(
+        "migration {version} was applied with other content than this release carries; the database is not ours"
+    )]
     MigrationChanged {
         /// Its number.
         version: i64,
@@ -162,9 +174,10 @@ impl StoreError {
             Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
             Self::ModelMismatch { .. } => ErrorCode::ModelMismatch,
             Self::CalibrationMismatch { .. } => ErrorCode::CalibrationMismatch,
-            Self::Corrupt { .. } | Self::CorruptMap { .. } | Self::CorruptHead { .. } | Self::Damaged { .. } => {
-                ErrorCode::CorruptRecord
-            }
+            Self::Corrupt { .. }
+            | Self::CorruptMap { .. }
+            | Self::CorruptHead { .. }
+            | Self::Damaged { .. } => ErrorCode::CorruptRecord,
             Self::DiskFull => ErrorCode::DiskFull,
             Self::Busy { .. } | Self::ReheadInProgress { .. } => ErrorCode::Overloaded,
             Self::Closing => ErrorCode::ShuttingDown,

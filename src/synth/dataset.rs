@@ -12,8 +12,8 @@ use time::{Duration, OffsetDateTime};
 
 /// A query matches references no farther than this in metres.
 const MATCH_RADIUS_M: f64 = 25.0;
-/// A query matches references whose heading differs by no more than this in degrees: beyond it the two cameras see
-/// different fronts.
+/// A query matches references whose heading differs by no more than this in degrees: beyond it the
+/// two cameras see different fronts.
 const MATCH_TURN_DEG: f64 = 45.0;
 const JPEG_QUALITY: u8 = 90;
 /// 2026-05-04T10:00:00Z.
@@ -87,8 +87,8 @@ struct Shot {
     captured_at: OffsetDateTime,
 }
 
-/// Renders `database/`, `queries/`, `ground_truth.csv` (query, reference) and `positions.csv` (file, lat, lon,
-/// heading, captured_at) into `folder`; `progress` is called after each image.
+/// Renders `database/`, `queries/`, `ground_truth.csv` (query, reference) and `positions.csv`
+/// (file, lat, lon, heading, captured_at) into `folder`; `progress` is called after each image.
 ///
 /// # Errors
 /// See [`DatasetError`]. The tables are written last, so a folder that has them is complete.
@@ -98,7 +98,9 @@ pub fn write_dataset(
     progress: impl Fn() + Sync,
 ) -> Result<DatasetSummary, DatasetError> {
     if options.places == 0 || options.views == 0 || options.conditions.is_empty() {
-        return Err(DatasetError::Nothing("a data set needs at least one place, one view and one condition"));
+        return Err(DatasetError::Nothing(
+            "a data set needs at least one place, one view and one condition",
+        ));
     }
     let world = StreetWorld::new(options.seed);
     let references = references(world, options);
@@ -115,8 +117,15 @@ pub fn write_dataset(
         Ok::<_, DatasetError>(())
     })?;
     let unmatched = write_ground_truth(&folder.join("ground_truth.csv"), &queries, &references)?;
-    write_positions(&folder.join("positions.csv"), references.iter().chain(&queries))?;
-    Ok(DatasetSummary { references: references.len(), queries: queries.len(), unmatched })
+    write_positions(
+        &folder.join("positions.csv"),
+        references.iter().chain(&queries),
+    )?;
+    Ok(DatasetSummary {
+        references: references.len(),
+        queries: queries.len(),
+        unmatched,
+    })
 }
 
 /// How many images `options` asks for, for a progress bar.
@@ -131,7 +140,11 @@ fn unmatched_count(options: &DatasetOptions) -> u64 {
 /// Views of a place in turn: ahead and to either side, so that every front is mapped.
 fn reference_viewpoint(world: StreetWorld, place: u64, view: u64) -> Viewpoint {
     let mut dice = Dice::new(&[world.seed, 0xdb, place, view]);
-    let side = if (place + view).is_multiple_of(2) { 1.0 } else { -1.0 };
+    let side = if (place + view).is_multiple_of(2) {
+        1.0
+    } else {
+        -1.0
+    };
     Viewpoint {
         along_m: f64::from(dice.real(-3.0..3.0)),
         across_m: -side * f64::from(dice.real(0.8..2.6)),
@@ -140,7 +153,8 @@ fn reference_viewpoint(world: StreetWorld, place: u64, view: u64) -> Viewpoint {
 }
 
 fn references(world: StreetWorld, options: &DatasetOptions) -> Vec<Shot> {
-    let views = (0..options.places).flat_map(|place| (0..options.views).map(move |view| (place, view)));
+    let views =
+        (0..options.places).flat_map(|place| (0..options.views).map(move |view| (place, view)));
     views
         .map(|(place, view)| {
             let viewpoint = reference_viewpoint(world, place, view);
@@ -150,7 +164,8 @@ fn references(world: StreetWorld, options: &DatasetOptions) -> Vec<Shot> {
         .collect()
 }
 
-/// One query of every place, from elsewhere, in other light and more traffic; then some of places that nobody mapped.
+/// One query of every place, from elsewhere, in other light and more traffic; then some of places
+/// that nobody mapped.
 fn queries(world: StreetWorld, options: &DatasetOptions) -> Vec<Shot> {
     // Unmapped places lie on streets of their own, a street away from the last mapped one.
     let beyond = (options.places / PLACES_PER_STREET + 2) * PLACES_PER_STREET;
@@ -169,7 +184,11 @@ fn queries(world: StreetWorld, options: &DatasetOptions) -> Vec<Shot> {
             };
             let condition = options.conditions[number % options.conditions.len()];
             let moment = seed_of(&[world.seed, 0x9e5, place, 1]);
-            let capture = Capture { condition, traffic: dice.real(0.8..2.0), moment };
+            let capture = Capture {
+                condition,
+                traffic: dice.real(0.8..2.0),
+                moment,
+            };
             shot(world, "queries", (place, view), viewpoint, capture)
         })
         .collect()
@@ -183,28 +202,61 @@ fn shot(
     capture: Capture,
 ) -> Shot {
     let (location, heading) = (world.position(place, viewpoint), world.heading(viewpoint));
-    let hour = if capture.condition == Condition::Dusk { 10 } else { 0 };
+    let hour = if capture.condition == Condition::Dusk {
+        10
+    } else {
+        0
+    };
     let days = if folder == "queries" { 45 } else { 0 };
-    let offset = Duration::days(days) + Duration::hours(hour) + Duration::seconds((place % 3600) as i64);
+    let offset =
+        Duration::days(days) + Duration::hours(hour) + Duration::seconds((place % 3600) as i64);
     // A fixed date in range plus at most 46 days.
-    let captured_at = OffsetDateTime::from_unix_timestamp(FIRST_CAPTURE).unwrap_or(OffsetDateTime::UNIX_EPOCH) + offset;
-    let name = file_name(location, heading, captured_at, &format!("p{place:06}v{view}"), capture.condition);
-    Shot { folder, name, place, viewpoint, capture, location, heading, captured_at }
+    let captured_at = OffsetDateTime::from_unix_timestamp(FIRST_CAPTURE)
+        .unwrap_or(OffsetDateTime::UNIX_EPOCH)
+        + offset;
+    let name = file_name(
+        location,
+        heading,
+        captured_at,
+        &format!("p{place:06}v{view}"),
+        capture.condition,
+    );
+    Shot {
+        folder,
+        name,
+        place,
+        viewpoint,
+        capture,
+        location,
+        heading,
+        captured_at,
+    }
 }
 
 /// `@utm_east@utm_north@zone@band@lat@lon@panorama@tile@heading@pitch@roll@height@timestamp@note@.jpg`.
-fn file_name(location: GeoPoint, heading: Heading, at: OffsetDateTime, id: &str, condition: Condition) -> String {
+fn file_name(
+    location: GeoPoint,
+    heading: Heading,
+    at: OffsetDateTime,
+    id: &str,
+    condition: Condition,
+) -> String {
     let (lat, lon) = (location.lat(), location.lon());
     let (north, east, _) = utm::to_utm_wgs84_no_zone(lat, lon);
     let zone = utm::lat_lon_to_zone_number(lat, lon);
     let band = utm::lat_to_zone_letter(lat).unwrap_or('X');
     let stamp = format!("{:04}{:02}{:02}", at.year(), u8::from(at.month()), at.day());
     let heading = heading.degrees();
-    format!("@{east:.2}@{north:.2}@{zone}@{band}@{lat:.6}@{lon:.6}@{id}@@{heading:.1}@@@@{stamp}@{condition}@.jpg")
+    format!(
+        "@{east:.2}@{north:.2}@{zone}@{band}@{lat:.6}@{lon:.6}@{id}@@{heading:.1}@@@@{stamp}@{condition}@.jpg"
+    )
 }
 
 fn make_empty(folder: &Path) -> Result<(), DatasetError> {
-    let fail = |source| DatasetError::Write { path: folder.to_owned(), source };
+    let fail = |source| DatasetError::Write {
+        path: folder.to_owned(),
+        source,
+    };
     fs::create_dir_all(folder).map_err(fail)?;
     match fs::read_dir(folder).map_err(fail)?.next() {
         Some(_) => Err(DatasetError::NotEmpty(folder.to_owned())),
@@ -212,12 +264,19 @@ fn make_empty(folder: &Path) -> Result<(), DatasetError> {
     }
 }
 
-/// One accepted pair a row; a query without any has one row with an empty reference. Returns how many have none.
-fn write_ground_truth(path: &Path, queries: &[Shot], references: &[Shot]) -> Result<usize, DatasetError> {
+/// One accepted pair a row; a query without any has one row with an empty reference. Returns how
+/// many have none.
+fn write_ground_truth(
+    path: &Path,
+    queries: &[Shot],
+    references: &[Shot],
+) -> Result<usize, DatasetError> {
     let mut rows = vec![["query".to_owned(), "reference".to_owned()]];
     let mut unmatched = 0;
     for query in queries {
-        let matches = references.iter().filter(|reference| shows_the_same(query, reference));
+        let matches = references
+            .iter()
+            .filter(|reference| shows_the_same(query, reference));
         let before = rows.len();
         rows.extend(matches.map(|reference| [query.name.clone(), reference.name.clone()]));
         if rows.len() == before {
@@ -230,11 +289,15 @@ fn write_ground_truth(path: &Path, queries: &[Shot], references: &[Shot]) -> Res
 }
 
 fn shows_the_same(query: &Shot, reference: &Shot) -> bool {
-    let turn = (query.heading.degrees() - reference.heading.degrees() + 540.0).rem_euclid(360.0) - 180.0;
+    let turn =
+        (query.heading.degrees() - reference.heading.degrees() + 540.0).rem_euclid(360.0) - 180.0;
     turn.abs() <= MATCH_TURN_DEG && query.location.distance_m(reference.location) <= MATCH_RADIUS_M
 }
 
-fn write_positions<'a>(path: &Path, shots: impl Iterator<Item = &'a Shot>) -> Result<(), DatasetError> {
+fn write_positions<'a>(
+    path: &Path,
+    shots: impl Iterator<Item = &'a Shot>,
+) -> Result<(), DatasetError> {
     let header = ["file", "lat", "lon", "heading", "captured_at"].map(str::to_owned);
     let rows = shots.map(|shot| {
         [
@@ -249,11 +312,22 @@ fn write_positions<'a>(path: &Path, shots: impl Iterator<Item = &'a Shot>) -> Re
     write_table(path, std::iter::once(header).chain(rows))
 }
 
-fn write_table<const N: usize>(path: &Path, rows: impl IntoIterator<Item = [String; N]>) -> Result<(), DatasetError> {
-    let fail = |source| DatasetError::Table { path: path.to_owned(), source };
+fn write_table<const N: usize>(
+    path: &Path,
+    rows: impl IntoIterator<Item = [String; N]>,
+) -> Result<(), DatasetError> {
+    let fail = |source| DatasetError::Table {
+        path: path.to_owned(),
+        source,
+    };
     let mut writer = csv::Writer::from_path(path).map_err(fail)?;
-    rows.into_iter().try_for_each(|row| writer.write_record(row)).map_err(fail)?;
-    writer.flush().map_err(|source| DatasetError::Write { path: path.to_owned(), source })
+    rows.into_iter()
+        .try_for_each(|row| writer.write_record(row))
+        .map_err(fail)?;
+    writer.flush().map_err(|source| DatasetError::Write {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 #[cfg(test)]
@@ -263,19 +337,41 @@ mod tests {
     use std::collections::{HashMap, HashSet};
 
     fn options() -> DatasetOptions {
-        let size = ImageSize { width: 48, height: 36 };
-        DatasetOptions { places: 2, views: 1, seed: 4, size, conditions: vec![Condition::Dusk, Condition::Overcast] }
+        let size = ImageSize {
+            width: 48,
+            height: 36,
+        };
+        DatasetOptions {
+            places: 2,
+            views: 1,
+            seed: 4,
+            size,
+            conditions: vec![Condition::Dusk, Condition::Overcast],
+        }
     }
 
     fn rows(path: &Path) -> Vec<csv::StringRecord> {
-        csv::Reader::from_path(path).unwrap().records().map(Result::unwrap).collect()
+        csv::Reader::from_path(path)
+            .unwrap()
+            .records()
+            .map(Result::unwrap)
+            .collect()
     }
 
     #[test]
     fn a_data_set_is_whole_consistent_and_the_same_twice() {
         let folders = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
-        let summaries = folders.each_ref().map(|folder| write_dataset(folder.path(), &options(), || {}).unwrap());
-        assert_eq!(summaries[0], DatasetSummary { references: 2, queries: 3, unmatched: 1 });
+        let summaries = folders
+            .each_ref()
+            .map(|folder| write_dataset(folder.path(), &options(), || {}).unwrap());
+        assert_eq!(
+            summaries[0],
+            DatasetSummary {
+                references: 2,
+                queries: 3,
+                unmatched: 1
+            }
+        );
         let folder = folders[0].path();
         let positions = rows(&folder.join("positions.csv"));
         assert_eq!(positions.len(), 5);
@@ -284,7 +380,10 @@ mod tests {
         for row in &positions {
             let bytes = fs::read(folder.join(&row[0])).unwrap();
             assert_eq!(bytes, fs::read(folders[1].path().join(&row[0])).unwrap());
-            assert_eq!(decode(&bytes, &ImageConfig::default()).unwrap().size, options().size);
+            assert_eq!(
+                decode(&bytes, &ImageConfig::default()).unwrap().size,
+                options().size
+            );
             let place = GeoPoint::new(row[1].parse().unwrap(), row[2].parse().unwrap()).unwrap();
             assert!(OffsetDateTime::parse(&row[4], &Rfc3339).is_ok());
             places.insert(row[0].split_once('/').unwrap().1.to_owned(), place);
@@ -296,10 +395,16 @@ mod tests {
             assert!(places[&row[0]].distance_m(places[&row[1]]) <= MATCH_RADIUS_M);
         }
         for row in truth.iter().filter(|row| row[1].is_empty()) {
-            let far = positions.iter().filter(|position| position[0].starts_with("database/"));
+            let far = positions
+                .iter()
+                .filter(|position| position[0].starts_with("database/"));
             let query = places[&row[0]];
-            let name = |position: &csv::StringRecord| position[0].split_once('/').unwrap().1.to_owned();
-            assert!(far.map(|position| places[&name(position)].distance_m(query)).all(|metres| metres > 100.0));
+            let name =
+                |position: &csv::StringRecord| position[0].split_once('/').unwrap().1.to_owned();
+            assert!(
+                far.map(|position| places[&name(position)].distance_m(query))
+                    .all(|metres| metres > 100.0)
+            );
         }
     }
 
@@ -309,7 +414,10 @@ mod tests {
         let shot = references(world, &options()).remove(0);
         let fields: Vec<&str> = shot.name.split('@').collect();
         let number = |i: usize| fields[i].parse::<f64>().unwrap();
-        assert_eq!((fields.len(), fields[3], fields[4], fields[15]), (16, "32", "U", ".jpg"));
+        assert_eq!(
+            (fields.len(), fields[3], fields[4], fields[15]),
+            (16, "32", "U", ".jpg")
+        );
         let (lat, lon) = utm::wsg84_utm_to_lat_lon(number(1), number(2), 32, 'U').unwrap();
         assert!(GeoPoint::new(lat, lon).unwrap().distance_m(shot.location) < 0.1);
         assert!((number(9) - shot.heading.degrees()).abs() <= 0.05);
@@ -320,8 +428,17 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         fs::create_dir_all(folder.path().join("database")).unwrap();
         fs::write(folder.path().join("database/mine.jpg"), b"keep").unwrap();
-        assert!(matches!(write_dataset(folder.path(), &options(), || {}), Err(DatasetError::NotEmpty(_))));
-        let empty = DatasetOptions { places: 0, ..options() };
-        assert!(matches!(write_dataset(folder.path(), &empty, || {}), Err(DatasetError::Nothing(_))));
+        assert!(matches!(
+            write_dataset(folder.path(), &options(), || {}),
+            Err(DatasetError::NotEmpty(_))
+        ));
+        let empty = DatasetOptions {
+            places: 0,
+            ..options()
+        };
+        assert!(matches!(
+            write_dataset(folder.path(), &empty, || {}),
+            Err(DatasetError::Nothing(_))
+        ));
     }
 }

@@ -9,7 +9,13 @@ pub(super) fn paint_front(style: &HouseStyle, width: f32, scale: f32, seed: u64)
     let height = style.height();
     let mut front = Painting::new(width, height, scale);
     let mut dice = Dice::new(&[seed, 1]);
-    paint_wall(&mut front, style.material, style.wall, [width, height], seed);
+    paint_wall(
+        &mut front,
+        style.material,
+        style.wall,
+        [width, height],
+        seed,
+    );
     if style.material == Material::Timber {
         paint_timber(&mut front, style, width, &mut dice);
     }
@@ -18,8 +24,10 @@ pub(super) fn paint_front(style: &HouseStyle, width: f32, scale: f32, seed: u64)
     let left = (width - bays as f32 * bay) / 2.0;
     // One column in three carries balconies, the same on every floor.
     let balcony_bay = dice.whole(0..3);
-    let window =
-        WindowSize { width: bay * window_share(style.window) * dice.real(0.85..1.1), height: dice.real(1.4..1.9) };
+    let window = WindowSize {
+        width: bay * window_share(style.window) * dice.real(0.85..1.1),
+        height: dice.real(1.4..1.9),
+    };
     for floor in 0..style.floors {
         let top = height - style.ground_height - (floor + 1) as f32 * style.floor_height + 0.55;
         if dice.chance(0.35) {
@@ -38,7 +46,15 @@ pub(super) fn paint_front(style: &HouseStyle, width: f32, scale: f32, seed: u64)
         front.rect(0.0, 0.26, width, 0.12, shaded(style.trim, 0.75));
         front.tint(0.0, 0.38, width, 0.25, [0, 0, 0], 0.28);
         let teeth = (width / 0.5) as usize;
-        (0..teeth).for_each(|i| front.rect(i as f32 * 0.5 + 0.1, 0.38, 0.18, 0.14, shaded(style.trim, 0.85)));
+        (0..teeth).for_each(|i| {
+            front.rect(
+                i as f32 * 0.5 + 0.1,
+                0.38,
+                0.18,
+                0.14,
+                shaded(style.trim, 0.85),
+            )
+        });
     }
     let ground = height - style.ground_height;
     if style.shop {
@@ -59,20 +75,39 @@ pub(super) fn paint_front(style: &HouseStyle, width: f32, scale: f32, seed: u64)
 pub(super) fn paint_side(style: &HouseStyle, depth: f32, scale: f32, seed: u64) -> Painting {
     let height = style.height();
     let mut side = Painting::new(depth, height, scale);
-    paint_wall(&mut side, style.material, shaded(style.wall, 0.9), [depth, height], seed ^ 0x51de);
+    paint_wall(
+        &mut side,
+        style.material,
+        shaded(style.wall, 0.9),
+        [depth, height],
+        seed ^ 0x51de,
+    );
     weather(&mut side, height, seed ^ 0x51de);
     side
 }
 
 /// Paints roof tiles.
-pub(super) fn paint_roof(style: &HouseStyle, width: f32, depth: f32, scale: f32, seed: u64) -> Painting {
+pub(super) fn paint_roof(
+    style: &HouseStyle,
+    width: f32,
+    depth: f32,
+    scale: f32,
+    seed: u64,
+) -> Painting {
     let mut roof = Painting::new(width, depth, scale);
     roof.rect(0.0, 0.0, width, depth, style.roof);
     let mut dice = Dice::new(&[seed, 2]);
     for _ in 0..dice.whole(0..4) {
         let x = dice.real(0.8..(width - 2.0).max(0.9));
         roof.rect(x - 0.1, depth * 0.3, 1.1, depth * 0.4, [60, 60, 62]);
-        roof.gradient(x, depth * 0.33, 0.9, depth * 0.33, [150, 170, 190], [70, 84, 100]);
+        roof.gradient(
+            x,
+            depth * 0.33,
+            0.9,
+            depth * 0.33,
+            [150, 170, 190],
+            [70, 84, 100],
+        );
     }
     roof.modulate(|x, y| {
         let row = (y / 0.3).floor();
@@ -98,7 +133,13 @@ fn window_share(kind: WindowKind) -> f32 {
     }
 }
 
-fn paint_wall(wall: &mut Painting, material: Material, colour: [u8; 3], [width, height]: [f32; 2], seed: u64) {
+fn paint_wall(
+    wall: &mut Painting,
+    material: Material,
+    colour: [u8; 3],
+    [width, height]: [f32; 2],
+    seed: u64,
+) {
     wall.rect(0.0, 0.0, width, height, colour);
     wall.modulate(|x, y| {
         let grain = 0.9 + 0.2 * fractal(seed, x * 1.1, y * 1.1, 4);
@@ -106,7 +147,9 @@ fn paint_wall(wall: &mut Painting, material: Material, colour: [u8; 3], [width, 
             * match material {
                 Material::Brick => courses(seed, x, y, [0.26, 0.1], 0.3, 1.3),
                 Material::Stone => courses(seed, x, y, [0.75, 0.4], 0.14, 0.75),
-                Material::Plaster | Material::Timber => 0.94 + 0.12 * noise(seed ^ 9, x * 14.0, y * 14.0),
+                Material::Plaster | Material::Timber => {
+                    0.94 + 0.12 * noise(seed ^ 9, x * 14.0, y * 14.0)
+                }
                 Material::Panel => courses(seed, x, y, [1.6, 1.1], 0.05, 0.7),
             }
     });
@@ -127,7 +170,13 @@ fn paint_timber(front: &mut Painting, style: &HouseStyle, width: f32, dice: &mut
     let posts = (width / 1.3).round().max(2.0);
     let spacing = width / posts;
     for floor in 0..=style.floors {
-        front.rect(0.0, upper - floor as f32 * style.floor_height - 0.1, width, 0.2, beam);
+        front.rect(
+            0.0,
+            upper - floor as f32 * style.floor_height - 0.1,
+            width,
+            0.2,
+            beam,
+        );
     }
     for post in 0..=posts as usize {
         let x = post as f32 * spacing;
@@ -135,8 +184,16 @@ fn paint_timber(front: &mut Painting, style: &HouseStyle, width: f32, dice: &mut
         for floor in 0..style.floors {
             if post < posts as usize && dice.chance(0.45) {
                 let bottom = upper - floor as f32 * style.floor_height;
-                let (from, to) = if dice.chance(0.5) { (x, x + spacing) } else { (x + spacing, x) };
-                front.line(&[[from, bottom], [to, bottom - style.floor_height]], 0.13, beam);
+                let (from, to) = if dice.chance(0.5) {
+                    (x, x + spacing)
+                } else {
+                    (x + spacing, x)
+                };
+                front.line(
+                    &[[from, bottom], [to, bottom - style.floor_height]],
+                    0.13,
+                    beam,
+                );
             }
         }
     }
@@ -157,9 +214,20 @@ fn paint_window(
     let (centre, frame) = (x + width / 2.0, 0.09);
     let surround = shaded(style.trim, 0.95);
     if style.window == WindowKind::Arched {
-        front.ellipse([centre, y], [width / 2.0 + frame, width / 2.0 + frame], surround, 1.0);
+        front.ellipse(
+            [centre, y],
+            [width / 2.0 + frame, width / 2.0 + frame],
+            surround,
+            1.0,
+        );
     }
-    front.rect(x - frame, y - frame, width + 2.0 * frame, height + 2.0 * frame, surround);
+    front.rect(
+        x - frame,
+        y - frame,
+        width + 2.0 * frame,
+        height + 2.0 * frame,
+        surround,
+    );
     paint_glass(front, [x, y], [width, height], dice);
     if style.window == WindowKind::Arched {
         front.ellipse([centre, y], [width / 2.0, width / 2.0], [62, 74, 88], 1.0);
@@ -169,20 +237,41 @@ fn paint_window(
     // The reveal throws a shadow on the glass, the sill one on the wall.
     front.tint(x, y, width, 0.16, [0, 0, 0], 0.45);
     front.tint(x, y, 0.08, height, [0, 0, 0], 0.3);
-    front.rect(x - 0.15, y + height, width + 0.3, 0.1, shaded(style.trim, 1.05));
-    front.tint(x - 0.15, y + height + 0.1, width + 0.3, 0.12, [0, 0, 0], 0.35);
+    front.rect(
+        x - 0.15,
+        y + height,
+        width + 0.3,
+        0.1,
+        shaded(style.trim, 1.05),
+    );
+    front.tint(
+        x - 0.15,
+        y + height + 0.1,
+        width + 0.3,
+        0.12,
+        [0, 0, 0],
+        0.35,
+    );
     if style.shutters {
         let leaf = width * 0.45;
         for left in [x - leaf - 0.1, x + width + 0.1] {
             if dice.chance(0.92) {
                 front.rect(left, y, leaf, height, style.accent);
                 let slats = (height / 0.12) as usize;
-                (0..slats).for_each(|i| front.tint(left, y + i as f32 * 0.12, leaf, 0.04, [0, 0, 0], 0.28));
+                (0..slats).for_each(|i| {
+                    front.tint(left, y + i as f32 * 0.12, leaf, 0.04, [0, 0, 0], 0.28)
+                });
             }
         }
     }
     if balcony {
-        paint_balcony(front, style, [x - 0.5, y + height - 0.95], width + 1.0, dice);
+        paint_balcony(
+            front,
+            style,
+            [x - 0.5, y + height - 0.95],
+            width + 1.0,
+            dice,
+        );
     } else if dice.chance(0.16) {
         paint_flower_box(front, [x, y + height - 0.12], width, dice);
     }
@@ -197,7 +286,8 @@ fn paint_glass(front: &mut Painting, [x, y]: [f32; 2], [width, height]: [f32; 2]
             let drawn = height * dice.real(0.2..0.9);
             let blind = dice.vary([206, 200, 186], 10.0);
             front.rect(x, y, width, drawn, blind);
-            (0..(drawn / 0.12) as usize).for_each(|i| front.tint(x, y + i as f32 * 0.12, width, 0.03, [0, 0, 0], 0.2));
+            (0..(drawn / 0.12) as usize)
+                .for_each(|i| front.tint(x, y + i as f32 * 0.12, width, 0.03, [0, 0, 0], 0.2));
         }
         1 | 2 => {
             let curtain = dice.vary([222, 214, 200], 12.0);
@@ -213,7 +303,12 @@ fn paint_glass(front: &mut Painting, [x, y]: [f32; 2], [width, height]: [f32; 2]
     let slant = x + width * dice.real(0.1..0.6);
     let end = (slant + width * 0.3).min(x + width);
     front.polygon(
-        &[[slant, y], [end, y], [end - width * 0.1, y + height * 0.6], [slant - width * 0.05, y + height * 0.6]],
+        &[
+            [slant, y],
+            [end, y],
+            [end - width * 0.1, y + height * 0.6],
+            [slant - width * 0.05, y + height * 0.6],
+        ],
         shaded(sky, 1.12),
     );
     if dice.chance(0.45) {
@@ -221,7 +316,12 @@ fn paint_glass(front: &mut Painting, [x, y]: [f32; 2], [width, height]: [f32; 2]
     }
 }
 
-fn paint_bars(front: &mut Painting, style: &HouseStyle, [x, y]: [f32; 2], [width, height]: [f32; 2]) {
+fn paint_bars(
+    front: &mut Painting,
+    style: &HouseStyle,
+    [x, y]: [f32; 2],
+    [width, height]: [f32; 2],
+) {
     let bar = 0.06;
     let mut upright = |share: f32, top: f32, length: f32| {
         front.rect(x + width * share - bar / 2.0, top, bar, length, style.trim);
@@ -229,11 +329,17 @@ fn paint_bars(front: &mut Painting, style: &HouseStyle, [x, y]: [f32; 2], [width
     match style.window {
         WindowKind::Plain => {}
         WindowKind::Cross | WindowKind::Arched => upright(0.5, y, height),
-        WindowKind::Sash => [1.0 / 3.0, 2.0 / 3.0].into_iter().for_each(|share| upright(share, y, height / 2.0)),
-        WindowKind::Band => [0.25, 0.5, 0.75].into_iter().for_each(|share| upright(share, y, height)),
+        WindowKind::Sash => [1.0 / 3.0, 2.0 / 3.0]
+            .into_iter()
+            .for_each(|share| upright(share, y, height / 2.0)),
+        WindowKind::Band => [0.25, 0.5, 0.75]
+            .into_iter()
+            .for_each(|share| upright(share, y, height)),
     }
     match style.window {
-        WindowKind::Cross | WindowKind::Arched => front.rect(x, y + height * 0.33, width, bar, style.trim),
+        WindowKind::Cross | WindowKind::Arched => {
+            front.rect(x, y + height * 0.33, width, bar, style.trim)
+        }
         WindowKind::Sash => {
             front.rect(x, y + height * 0.5 - 0.04, width, 0.08, style.trim);
             front.rect(x, y + height * 0.25, width, bar * 0.7, style.trim);
@@ -242,14 +348,21 @@ fn paint_bars(front: &mut Painting, style: &HouseStyle, [x, y]: [f32; 2], [width
     }
 }
 
-fn paint_balcony(front: &mut Painting, style: &HouseStyle, [x, y]: [f32; 2], width: f32, dice: &mut Dice) {
+fn paint_balcony(
+    front: &mut Painting,
+    style: &HouseStyle,
+    [x, y]: [f32; 2],
+    width: f32,
+    dice: &mut Dice,
+) {
     front.tint(x, y + 1.05, width, 0.45, [0, 0, 0], 0.4);
     front.rect(x, y + 0.93, width, 0.16, shaded(style.trim, 0.85));
     let rail = dice.pick(&[[44, 44, 48], [200, 198, 192], [70, 60, 54]]);
     if dice.chance(0.35) {
         front.rect(x, y, width, 0.93, style.accent);
     } else {
-        (0..=(width / 0.13) as usize).for_each(|i| front.rect(x + i as f32 * 0.13, y, 0.035, 0.95, rail));
+        (0..=(width / 0.13) as usize)
+            .for_each(|i| front.rect(x + i as f32 * 0.13, y, 0.035, 0.95, rail));
     }
     front.rect(x, y, width, 0.07, rail);
     if dice.chance(0.4) {
@@ -260,7 +373,13 @@ fn paint_balcony(front: &mut Painting, style: &HouseStyle, [x, y]: [f32; 2], wid
 fn paint_flower_box(front: &mut Painting, [x, y]: [f32; 2], width: f32, dice: &mut Dice) {
     front.rect(x, y, width, 0.18, [110, 74, 52]);
     for _ in 0..(width * 14.0) as usize {
-        let leaf = dice.pick(&[[60, 104, 48], [84, 126, 60], [200, 60, 70], [226, 170, 60], [214, 120, 170]]);
+        let leaf = dice.pick(&[
+            [60, 104, 48],
+            [84, 126, 60],
+            [200, 60, 70],
+            [226, 170, 60],
+            [214, 120, 170],
+        ]);
         let at = [x + dice.real(0.0..1.0) * width, y - dice.real(-0.05..0.16)];
         front.ellipse(at, [0.07, 0.06], leaf, 1.0);
     }
@@ -281,10 +400,26 @@ fn paint_ground_floor(
     for column in 0..bays {
         let x = left + column as f32 * bay;
         if column == door_bay {
-            paint_door(front, style, x + bay / 2.0 - 0.55, ground + style.ground_height - 2.55, dice);
+            paint_door(
+                front,
+                style,
+                x + bay / 2.0 - 0.55,
+                ground + style.ground_height - 2.55,
+                dice,
+            );
         } else {
-            let size = WindowSize { width: bay * 0.5, height: 1.5 };
-            paint_window(front, style, [x + bay * 0.25, ground + 0.8], size, false, dice);
+            let size = WindowSize {
+                width: bay * 0.5,
+                height: 1.5,
+            };
+            paint_window(
+                front,
+                style,
+                [x + bay * 0.25, ground + 0.8],
+                size,
+                false,
+                dice,
+            );
         }
     }
 }
@@ -294,7 +429,11 @@ fn paint_door(front: &mut Painting, style: &HouseStyle, x: f32, y: f32, dice: &m
     front.rect(x - 0.18, y - 0.45, width + 0.36, height + 0.45, style.trim);
     front.gradient(x, y - 0.35, width, 0.32, [126, 146, 164], [60, 70, 84]);
     front.glow(x, y - 0.35, width, 0.32, 0.8);
-    let painted = if dice.chance(0.6) { style.accent } else { [96, 66, 46] };
+    let painted = if dice.chance(0.6) {
+        style.accent
+    } else {
+        [96, 66, 46]
+    };
     let leaf = dice.vary(painted, 10.0);
     front.rect(x, y, width, height, leaf);
     let panels = dice.whole(1..4);
@@ -302,20 +441,49 @@ fn paint_door(front: &mut Painting, style: &HouseStyle, x: f32, y: f32, dice: &m
     for i in 0..panels {
         let top = y + 0.15 + i as f32 * tall;
         for left in [x + 0.12, x + width / 2.0 + 0.06] {
-            front.rect(left, top, width / 2.0 - 0.18, tall - 0.15, shaded(leaf, 0.76));
+            front.rect(
+                left,
+                top,
+                width / 2.0 - 0.18,
+                tall - 0.15,
+                shaded(leaf, 0.76),
+            );
         }
     }
-    front.ellipse([x + width - 0.12, y + height * 0.55], [0.05, 0.05], [224, 196, 110], 1.0);
+    front.ellipse(
+        [x + width - 0.12, y + height * 0.55],
+        [0.05, 0.05],
+        [224, 196, 110],
+        1.0,
+    );
     front.rect(x - 0.3, y + height, width + 0.6, 0.12, [150, 146, 140]);
     // House number, bell plate.
     front.rect(x + width + 0.28, y + 0.6, 0.3, 0.22, [30, 50, 110]);
-    paint_lettering(front, [x + width + 0.31, y + 0.63], [0.24, 0.16], [240, 240, 240], 2, dice);
+    paint_lettering(
+        front,
+        [x + width + 0.31, y + 0.63],
+        [0.24, 0.16],
+        [240, 240, 240],
+        2,
+        dice,
+    );
     front.rect(x - 0.42, y + 1.1, 0.16, 0.3, [180, 170, 140]);
 }
 
 fn paint_shop(front: &mut Painting, style: &HouseStyle, width: f32, ground: f32, dice: &mut Dice) {
-    let surround = dice.pick(&[[50, 48, 50], [196, 190, 180], [96, 74, 58], shaded(style.accent, 0.6)]);
-    front.rect(0.1, ground + 0.1, width - 0.2, style.ground_height - 0.1, surround);
+    let surround = dice.pick(&[
+        [50, 48, 50],
+        [196, 190, 180],
+        [96, 74, 58],
+        shaded(style.accent, 0.6),
+    ]);
+    front.rect(
+        0.1,
+        ground + 0.1,
+        width - 0.2,
+        style.ground_height - 0.1,
+        surround,
+    );
     // Show windows with goods, and one door.
     let panes = dice.whole(2..5);
     let span = (width - 0.6) / panes as f32;
@@ -325,32 +493,71 @@ fn paint_shop(front: &mut Painting, style: &HouseStyle, width: f32, ground: f32,
         let foot = if pane == door { 0.06 } else { 0.55 };
         let height = style.ground_height - 1.05 - foot;
         let dark = dice.vary([58, 60, 62], 12.0);
-        front.gradient(x, top, span - 0.12, height, dice.vary([130, 140, 150], 16.0), dark);
+        front.gradient(
+            x,
+            top,
+            span - 0.12,
+            height,
+            dice.vary([130, 140, 150], 16.0),
+            dark,
+        );
         front.glow(x, top, span - 0.12, height, 0.9);
         if pane == door {
             front.rect(x, top, 0.08, height, surround);
             front.rect(x + span - 0.2, top, 0.08, height, surround);
-            front.rect(x + span * 0.7, top + height * 0.5, 0.05, 0.35, [210, 206, 196]);
+            front.rect(
+                x + span * 0.7,
+                top + height * 0.5,
+                0.05,
+                0.35,
+                [210, 206, 196],
+            );
         } else {
             paint_goods(front, [x + 0.1, top + height], [span - 0.32, height], dice);
         }
         if dice.chance(0.3) {
             let (w, h) = (dice.real(0.3..0.7), dice.real(0.3..0.8));
             front.rect(x + 0.12, top + 0.3, w, h, dice.vary([220, 200, 150], 40.0));
-            paint_lettering(front, [x + 0.16, top + 0.4], [w - 0.08, h * 0.25], [40, 40, 60], 3, dice);
+            paint_lettering(
+                front,
+                [x + 0.16, top + 0.4],
+                [w - 0.08, h * 0.25],
+                [40, 40, 60],
+                3,
+                dice,
+            );
         }
     }
     // The fascia with the name.
     front.rect(0.1, ground + 0.1, width - 0.2, 0.8, style.accent);
     front.tint(0.1, ground + 0.84, width - 0.2, 0.12, [0, 0, 0], 0.4);
     let letters = dice.whole(5..11);
-    let (long, ink) = (letters as f32 * 0.48, dice.pick(&[[250, 246, 230], [250, 220, 120], [30, 30, 34]]));
-    let start = if dice.chance(0.5) { (width - long) / 2.0 } else { 0.5 };
-    paint_lettering(front, [start.max(0.2), ground + 0.24], [long.min(width - 0.5), 0.5], ink, letters, dice);
+    let (long, ink) = (
+        letters as f32 * 0.48,
+        dice.pick(&[[250, 246, 230], [250, 220, 120], [30, 30, 34]]),
+    );
+    let start = if dice.chance(0.5) {
+        (width - long) / 2.0
+    } else {
+        0.5
+    };
+    paint_lettering(
+        front,
+        [start.max(0.2), ground + 0.24],
+        [long.min(width - 0.5), 0.5],
+        ink,
+        letters,
+        dice,
+    );
     front.glow(0.1, ground + 0.1, width - 0.2, 0.8, 0.35);
 }
 
-fn paint_goods(front: &mut Painting, [left, bottom]: [f32; 2], [width, height]: [f32; 2], dice: &mut Dice) {
+fn paint_goods(
+    front: &mut Painting,
+    [left, bottom]: [f32; 2],
+    [width, height]: [f32; 2],
+    dice: &mut Dice,
+) {
     for _ in 0..dice.whole(4..12) {
         let colour = dice.vary([150, 120, 100], 60.0);
         let (w, h) = (dice.real(0.12..0.4), dice.real(0.15..0.5) * height);
@@ -363,7 +570,8 @@ fn paint_goods(front: &mut Painting, [left, bottom]: [f32; 2], [width, height]: 
     }
 }
 
-/// `count` invented letters: strokes between the nine points of a small grid, so that no two signs read alike.
+/// `count` invented letters: strokes between the nine points of a small grid, so that no two signs
+/// read alike.
 pub(super) fn paint_lettering(
     front: &mut Painting,
     [x, y]: [f32; 2],
@@ -376,7 +584,10 @@ pub(super) fn paint_lettering(
     for letter in 0..count {
         let left = x + letter as f32 * cell + cell * 0.12;
         let point = |dice: &mut Dice| {
-            [left + dice.whole(0..3) as f32 * cell * 0.36, y + dice.whole(0..3) as f32 * height / 2.0]
+            [
+                left + dice.whole(0..3) as f32 * cell * 0.36,
+                y + dice.whole(0..3) as f32 * height / 2.0,
+            ]
         };
         front.rect(left, y, cell * 0.16, height, ink);
         for _ in 0..dice.whole(2..4) {
@@ -390,8 +601,11 @@ pub(super) fn paint_lettering(
 fn weather(front: &mut Painting, height: f32, seed: u64) {
     front.modulate(|x, y| {
         let streaks = fractal(seed ^ 0x57e4, x * 5.0, y * 0.25, 3);
-        let soot =
-            1.0 - 0.22 * ((y - height + 1.4) / 1.4).clamp(0.0, 1.0) * fractal(seed ^ 0x5007, x * 2.0, y * 2.0, 2) * 1.6;
+        let soot = 1.0
+            - 0.22
+                * ((y - height + 1.4) / 1.4).clamp(0.0, 1.0)
+                * fractal(seed ^ 0x5007, x * 2.0, y * 2.0, 2)
+                * 1.6;
         (0.86 + 0.24 * streaks) * soot
     });
 }

@@ -1,8 +1,8 @@
 //! A canvas measured in metres for painting surfaces, with a second one for what glows at night.
 
 use tiny_skia::{
-    Color, FillRule, GradientStop, LinearGradient, Paint, PathBuilder, Pixmap, Point, PremultipliedColorU8, Rect,
-    SpreadMode, Stroke, Transform,
+    Color, FillRule, GradientStop, LinearGradient, Paint, PathBuilder, Pixmap, Point,
+    PremultipliedColorU8, Rect, SpreadMode, Stroke, Transform,
 };
 
 /// A painted surface.
@@ -18,8 +18,13 @@ impl Painting {
     pub(super) fn new(width: f32, height: f32, scale: f32) -> Self {
         let texels = |metres: f32| ((metres * scale).round() as u32).clamp(1, 4096);
         // Both sides are 1 to 4096 texels, which a pixmap always accepts.
-        let pixmap = || Pixmap::new(texels(width), texels(height)).expect("sides are positive and bounded");
-        Self { colour: pixmap(), glow: pixmap(), scale }
+        let pixmap =
+            || Pixmap::new(texels(width), texels(height)).expect("sides are positive and bounded");
+        Self {
+            colour: pixmap(),
+            glow: pixmap(),
+            scale,
+        }
     }
 
     /// Width and height in texels.
@@ -33,20 +38,50 @@ impl Painting {
     }
 
     /// A rectangle of partial opacity.
-    pub(super) fn tint(&mut self, left: f32, top: f32, width: f32, height: f32, colour: [u8; 3], opacity: f32) {
+    pub(super) fn tint(
+        &mut self,
+        left: f32,
+        top: f32,
+        width: f32,
+        height: f32,
+        colour: [u8; 3],
+        opacity: f32,
+    ) {
         if let Some(rect) = Rect::from_xywh(left, top, width, height) {
-            self.colour.fill_rect(rect, &solid(colour, opacity), self.transform(), None);
+            self.colour
+                .fill_rect(rect, &solid(colour, opacity), self.transform(), None);
         }
     }
 
     /// A rectangle shaded from `upper` to `lower`.
-    pub(super) fn gradient(&mut self, left: f32, top: f32, width: f32, height: f32, upper: [u8; 3], lower: [u8; 3]) {
-        let Some(rect) = Rect::from_xywh(left, top, width, height) else { return };
+    pub(super) fn gradient(
+        &mut self,
+        left: f32,
+        top: f32,
+        width: f32,
+        height: f32,
+        upper: [u8; 3],
+        lower: [u8; 3],
+    ) {
+        let Some(rect) = Rect::from_xywh(left, top, width, height) else {
+            return;
+        };
         let colour = |c: [u8; 3]| Color::from_rgba8(c[0], c[1], c[2], 255);
-        let stops = vec![GradientStop::new(0.0, colour(upper)), GradientStop::new(1.0, colour(lower))];
-        let (from, to) = (Point::from_xy(left, top), Point::from_xy(left + width * 0.4, top + height));
-        if let Some(shader) = LinearGradient::new(from, to, stops, SpreadMode::Pad, Transform::identity()) {
-            let paint = Paint { shader, ..Default::default() };
+        let stops = vec![
+            GradientStop::new(0.0, colour(upper)),
+            GradientStop::new(1.0, colour(lower)),
+        ];
+        let (from, to) = (
+            Point::from_xy(left, top),
+            Point::from_xy(left + width * 0.4, top + height),
+        );
+        if let Some(shader) =
+            LinearGradient::new(from, to, stops, SpreadMode::Pad, Transform::identity())
+        {
+            let paint = Paint {
+                shader,
+                ..Default::default()
+            };
             self.colour.fill_rect(rect, &paint, self.transform(), None);
         }
     }
@@ -54,30 +89,58 @@ impl Painting {
     /// Light given off by a rectangle at night, 0 to 1.
     pub(super) fn glow(&mut self, left: f32, top: f32, width: f32, height: f32, strength: f32) {
         if let Some(rect) = Rect::from_xywh(left, top, width, height) {
-            self.glow.fill_rect(rect, &solid([255; 3], strength), self.transform(), None);
+            self.glow
+                .fill_rect(rect, &solid([255; 3], strength), self.transform(), None);
         }
     }
 
     /// A filled ellipse.
-    pub(super) fn ellipse(&mut self, centre: [f32; 2], radii: [f32; 2], colour: [u8; 3], opacity: f32) {
-        let oval = Rect::from_xywh(centre[0] - radii[0], centre[1] - radii[1], 2.0 * radii[0], 2.0 * radii[1]);
+    pub(super) fn ellipse(
+        &mut self,
+        centre: [f32; 2],
+        radii: [f32; 2],
+        colour: [u8; 3],
+        opacity: f32,
+    ) {
+        let oval = Rect::from_xywh(
+            centre[0] - radii[0],
+            centre[1] - radii[1],
+            2.0 * radii[0],
+            2.0 * radii[1],
+        );
         if let Some(path) = oval.and_then(PathBuilder::from_oval) {
-            self.colour.fill_path(&path, &solid(colour, opacity), FillRule::Winding, self.transform(), None);
+            self.colour.fill_path(
+                &path,
+                &solid(colour, opacity),
+                FillRule::Winding,
+                self.transform(),
+                None,
+            );
         }
     }
 
     /// A filled polygon.
     pub(super) fn polygon(&mut self, points: &[[f32; 2]], colour: [u8; 3]) {
         if let Some(path) = path(points, true) {
-            self.colour.fill_path(&path, &solid(colour, 1.0), FillRule::Winding, self.transform(), None);
+            self.colour.fill_path(
+                &path,
+                &solid(colour, 1.0),
+                FillRule::Winding,
+                self.transform(),
+                None,
+            );
         }
     }
 
     /// A line through `points`.
     pub(super) fn line(&mut self, points: &[[f32; 2]], width: f32, colour: [u8; 3]) {
         if let Some(path) = path(points, false) {
-            let stroke = Stroke { width, ..Default::default() };
-            self.colour.stroke_path(&path, &solid(colour, 1.0), &stroke, self.transform(), None);
+            let stroke = Stroke {
+                width,
+                ..Default::default()
+            };
+            self.colour
+                .stroke_path(&path, &solid(colour, 1.0), &stroke, self.transform(), None);
         }
     }
 
@@ -95,7 +158,8 @@ impl Painting {
             let scaled = [texel.red(), texel.green(), texel.blue()]
                 .map(|channel| ((f32::from(channel) * factor).clamp(0.0, 255.0) as u8).min(alpha));
             // Each channel is at most alpha, as premultiplied colours must be.
-            *texel = PremultipliedColorU8::from_rgba(scaled[0], scaled[1], scaled[2], alpha).unwrap_or(*texel);
+            *texel = PremultipliedColorU8::from_rgba(scaled[0], scaled[1], scaled[2], alpha)
+                .unwrap_or(*texel);
         }
     }
 
@@ -107,8 +171,15 @@ impl Painting {
             .map(|(texel, glow)| {
                 let straight = texel.demultiply();
                 let alpha = f32::from(texel.alpha()) / 255.0;
-                let [r, g, b] = [straight.red(), straight.green(), straight.blue()].map(|v| linear[usize::from(v)]);
-                [r * alpha, g * alpha, b * alpha, alpha, f32::from(glow.alpha()) / 255.0]
+                let [r, g, b] = [straight.red(), straight.green(), straight.blue()]
+                    .map(|v| linear[usize::from(v)]);
+                [
+                    r * alpha,
+                    g * alpha,
+                    b * alpha,
+                    alpha,
+                    f32::from(glow.alpha()) / 255.0,
+                ]
             })
             .collect()
     }
@@ -120,7 +191,12 @@ impl Painting {
 
 fn solid(colour: [u8; 3], opacity: f32) -> Paint<'static> {
     let mut paint = Paint::default();
-    paint.set_color_rgba8(colour[0], colour[1], colour[2], (opacity.clamp(0.0, 1.0) * 255.0) as u8);
+    paint.set_color_rgba8(
+        colour[0],
+        colour[1],
+        colour[2],
+        (opacity.clamp(0.0, 1.0) * 255.0) as u8,
+    );
     paint
 }
 
@@ -128,7 +204,8 @@ fn path(points: &[[f32; 2]], closed: bool) -> Option<tiny_skia::Path> {
     let mut builder = PathBuilder::new();
     let (first, rest) = points.split_first()?;
     builder.move_to(first[0], first[1]);
-    rest.iter().for_each(|point| builder.line_to(point[0], point[1]));
+    rest.iter()
+        .for_each(|point| builder.line_to(point[0], point[1]));
     if closed {
         builder.close();
     }

@@ -21,7 +21,10 @@ pub(super) fn paint_tree(size: [f32; 2], scale: f32, seed: u64) -> Painting {
         bark,
     );
     for _ in 0..6 {
-        let tip = [middle + dice.real(-0.38..0.38) * width, height * dice.real(0.12..0.5)];
+        let tip = [
+            middle + dice.real(-0.38..0.38) * width,
+            height * dice.real(0.12..0.5),
+        ];
         tree.line(&[[middle + lean * 0.7, height * 0.55], tip], 0.09, bark);
     }
     let green = dice.pick(&[[72, 104, 50], [88, 116, 54], [64, 92, 56], [110, 118, 52]]);
@@ -29,7 +32,10 @@ pub(super) fn paint_tree(size: [f32; 2], scale: f32, seed: u64) -> Painting {
     for layer in 0..5 {
         let light = 0.62 + 0.14 * layer as f32;
         for _ in 0..90 {
-            let (angle, reach) = (dice.real(0.0..std::f32::consts::TAU), dice.real(0.0..1.0f32).sqrt());
+            let (angle, reach) = (
+                dice.real(0.0..std::f32::consts::TAU),
+                dice.real(0.0..1.0f32).sqrt(),
+            );
             let spread = 0.46 - 0.035 * layer as f32;
             let centre = [
                 middle + angle.cos() * reach * spread * width,
@@ -37,7 +43,12 @@ pub(super) fn paint_tree(size: [f32; 2], scale: f32, seed: u64) -> Painting {
             ];
             let radius = dice.real(0.12..0.34);
             let shade = light * (1.25 - centre[1] / height * 0.7);
-            tree.ellipse(centre, [radius, radius * 0.8], dice.vary(shaded(green, shade), 9.0), 0.96);
+            tree.ellipse(
+                centre,
+                [radius, radius * 0.8],
+                dice.vary(shaded(green, shade), 9.0),
+                0.96,
+            );
         }
     }
     tree.modulate(|x, y| 0.75 + 0.5 * lattice(seed, (x * 22.0) as i32, (y * 22.0) as i32));
@@ -71,7 +82,14 @@ pub(super) fn paint_road_sign(scale: f32, seed: u64) -> Painting {
         1 => {
             sign.ellipse([0.35, 0.35], [0.33, 0.33], [190, 30, 36], 1.0);
             sign.ellipse([0.35, 0.35], [0.25, 0.25], white, 1.0);
-            paint_lettering(&mut sign, [0.2, 0.24], [0.32, 0.22], [20, 20, 20], 2, &mut dice);
+            paint_lettering(
+                &mut sign,
+                [0.2, 0.24],
+                [0.32, 0.22],
+                [20, 20, 20],
+                2,
+                &mut dice,
+            );
         }
         2 => {
             sign.rect(0.04, 0.04, 0.62, 0.62, [24, 82, 160]);
@@ -96,13 +114,20 @@ pub(super) fn paint_hanging_sign(accent: [u8; 3], scale: f32, seed: u64) -> Pain
     } else {
         sign.ellipse([0.45, 0.5], [0.38, 0.37], accent, 1.0);
     }
-    paint_lettering(&mut sign, [0.2, 0.32], [0.52, 0.32], ink, dice.whole(1..4), &mut dice);
+    paint_lettering(
+        &mut sign,
+        [0.2, 0.32],
+        [0.52, 0.32],
+        ink,
+        dice.whole(1..4),
+        &mut dice,
+    );
     sign.glow(0.06, 0.12, 0.78, 0.72, 0.5);
     sign
 }
 
-/// The outline of a vehicle from its tail over the roof to its nose, in shares of length and height (down from the
-/// top), and whether the panel up to the next point is glass.
+/// The outline of a vehicle from its tail over the roof to its nose, in shares of length and height
+/// (down from the top), and whether the panel up to the next point is glass.
 pub(super) type Outline = [([f32; 2], bool)];
 
 /// A saloon car.
@@ -143,48 +168,136 @@ pub(super) fn paint_flank(
     let points: Vec<[f32; 2]> = outline.iter().map(|([x, y], _)| at(*x, *y)).collect();
     flank.polygon(&points, colour);
     if outline.len() == VAN.len() {
-        flank.polygon(&[at(0.66, 0.12), at(0.73, 0.12), at(0.83, 0.42), at(0.66, 0.42)], glass);
-        flank.rect(length * 0.64, height * 0.1, 0.03, height * 0.75, shaded(colour, 0.7));
+        flank.polygon(
+            &[
+                at(0.66, 0.12),
+                at(0.73, 0.12),
+                at(0.83, 0.42),
+                at(0.66, 0.42),
+            ],
+            glass,
+        );
+        flank.rect(
+            length * 0.64,
+            height * 0.1,
+            0.03,
+            height * 0.75,
+            shaded(colour, 0.7),
+        );
         if dice.chance(0.7) {
             let ink = dice.pick(&[[240, 240, 240], [30, 40, 90], [180, 40, 40], [40, 40, 44]]);
             let letters = dice.whole(4..9);
-            paint_lettering(&mut flank, at(0.1, 0.25), at(0.45, 0.2), ink, letters, &mut dice);
+            paint_lettering(
+                &mut flank,
+                at(0.1, 0.25),
+                at(0.45, 0.2),
+                ink,
+                letters,
+                &mut dice,
+            );
         }
     } else {
-        flank.polygon(&[at(0.2, 0.42), at(0.3, 0.11), at(0.44, 0.11), at(0.44, 0.42)], glass);
-        flank.polygon(&[at(0.47, 0.11), at(0.58, 0.11), at(0.7, 0.42), at(0.47, 0.42)], glass);
-        flank.rect(length * 0.455, height * 0.42, 0.02, height * 0.4, shaded(colour, 0.7));
+        flank.polygon(
+            &[at(0.2, 0.42), at(0.3, 0.11), at(0.44, 0.11), at(0.44, 0.42)],
+            glass,
+        );
+        flank.polygon(
+            &[
+                at(0.47, 0.11),
+                at(0.58, 0.11),
+                at(0.7, 0.42),
+                at(0.47, 0.42),
+            ],
+            glass,
+        );
+        flank.rect(
+            length * 0.455,
+            height * 0.42,
+            0.02,
+            height * 0.4,
+            shaded(colour, 0.7),
+        );
     }
-    flank.tint(length * 0.01, height * 0.57, length * 0.97, 0.04, [0, 0, 0], 0.3);
-    flank.rect(length * 0.02, height * 0.8, length * 0.96, height * 0.09, shaded(colour, 0.55));
+    flank.tint(
+        length * 0.01,
+        height * 0.57,
+        length * 0.97,
+        0.04,
+        [0, 0, 0],
+        0.3,
+    );
+    flank.rect(
+        length * 0.02,
+        height * 0.8,
+        length * 0.96,
+        height * 0.09,
+        shaded(colour, 0.55),
+    );
     for axle in [length * 0.19, length * 0.81] {
         flank.ellipse([axle, height - 0.34], [0.38, 0.38], [18, 18, 20], 1.0);
         flank.ellipse([axle, height - 0.31], [0.31, 0.31], [28, 28, 30], 1.0);
         flank.ellipse([axle, height - 0.31], [0.17, 0.17], [140, 142, 146], 1.0);
     }
-    flank.rect(length * 0.97, height * 0.58, length * 0.02, 0.12, [240, 236, 210]);
+    flank.rect(
+        length * 0.97,
+        height * 0.58,
+        length * 0.02,
+        0.12,
+        [240, 236, 210],
+    );
     flank.rect(length * 0.012, height * 0.56, 0.1, 0.14, [170, 24, 28]);
     flank
 }
 
 /// The tail or the nose of a vehicle: lamps, number plate, bumper.
-pub(super) fn paint_end([width, height]: [f32; 2], colour: [u8; 3], lamps: [u8; 3], scale: f32, seed: u64) -> Painting {
+pub(super) fn paint_end(
+    [width, height]: [f32; 2],
+    colour: [u8; 3],
+    lamps: [u8; 3],
+    scale: f32,
+    seed: u64,
+) -> Painting {
     let mut end = Painting::new(width, height, scale);
     let mut dice = Dice::new(&[seed, 8]);
     end.rect(0.0, 0.0, width, height, colour);
     if height > 1.2 {
         // A van's back doors.
-        end.rect(width / 2.0 - 0.01, 0.1, 0.03, height - 0.3, shaded(colour, 0.6));
+        end.rect(
+            width / 2.0 - 0.01,
+            0.1,
+            0.03,
+            height - 0.3,
+            shaded(colour, 0.6),
+        );
         for left in [0.2, width / 2.0 + 0.12] {
-            end.rect(left, height * 0.12, width / 2.0 - 0.32, height * 0.25, [52, 62, 72]);
+            end.rect(
+                left,
+                height * 0.12,
+                width / 2.0 - 0.32,
+                height * 0.25,
+                [52, 62, 72],
+            );
         }
     }
     let belt = (height - 0.5).max(0.05);
     for left in [0.04, width - 0.28] {
         end.rect(left, belt, 0.24, 0.15, lamps);
     }
-    end.rect(width / 2.0 - 0.27, height - 0.34, 0.54, 0.13, [236, 236, 230]);
-    paint_lettering(&mut end, [width / 2.0 - 0.23, height - 0.32], [0.46, 0.09], [20, 20, 24], 6, &mut dice);
+    end.rect(
+        width / 2.0 - 0.27,
+        height - 0.34,
+        0.54,
+        0.13,
+        [236, 236, 230],
+    );
+    paint_lettering(
+        &mut end,
+        [width / 2.0 - 0.23, height - 0.32],
+        [0.46, 0.09],
+        [20, 20, 24],
+        6,
+        &mut dice,
+    );
     end.rect(0.0, height - 0.17, width, 0.17, shaded(colour, 0.45));
     end
 }
@@ -193,21 +306,45 @@ pub(super) fn paint_end([width, height]: [f32; 2], colour: [u8; 3], lamps: [u8; 
 pub(super) fn paint_person(scale: f32, seed: u64) -> Painting {
     let mut person = Painting::new(0.8, 1.8, scale);
     let mut dice = Dice::new(&[seed, 9]);
-    let cloth = [[150, 50, 50], [50, 70, 110], [70, 90, 70], [190, 180, 160], [40, 40, 46], [190, 140, 50]];
+    let cloth = [
+        [150, 50, 50],
+        [50, 70, 110],
+        [70, 90, 70],
+        [190, 180, 160],
+        [40, 40, 46],
+        [190, 140, 50],
+    ];
     let coat = dice.pick(&cloth);
     let coat = dice.vary(coat, 14.0);
     let trousers = dice.pick(&[[40, 44, 60], [70, 62, 54], [30, 30, 32], [96, 100, 108]]);
-    let skin = dice.pick(&[[224, 184, 156], [164, 116, 86], [104, 72, 54], [236, 200, 176]]);
+    let skin = dice.pick(&[
+        [224, 184, 156],
+        [164, 116, 86],
+        [104, 72, 54],
+        [236, 200, 176],
+    ]);
     let stride = dice.real(0.04..0.18);
     person.line(&[[0.4, 0.95], [0.4 - stride, 1.72]], 0.15, trousers);
-    person.line(&[[0.42, 0.95], [0.42 + stride, 1.72]], 0.15, shaded(trousers, 0.8));
+    person.line(
+        &[[0.42, 0.95], [0.42 + stride, 1.72]],
+        0.15,
+        shaded(trousers, 0.8),
+    );
     person.rect(0.34 - stride, 1.7, 0.2, 0.09, [30, 28, 28]);
     person.rect(0.36 + stride, 1.7, 0.2, 0.09, [30, 28, 28]);
-    person.polygon(&[[0.24, 0.36], [0.56, 0.36], [0.6, 1.02], [0.22, 1.02]], coat);
+    person.polygon(
+        &[[0.24, 0.36], [0.56, 0.36], [0.6, 1.02], [0.22, 1.02]],
+        coat,
+    );
     person.line(&[[0.27, 0.42], [0.2, 0.95]], 0.1, shaded(coat, 0.82));
     person.line(&[[0.53, 0.42], [0.6, 0.92]], 0.1, shaded(coat, 0.9));
     person.ellipse([0.4, 0.2], [0.1, 0.13], skin, 1.0);
-    person.ellipse([0.4, 0.13], [0.11, 0.09], dice.pick(&[[40, 30, 26], [110, 76, 44], [160, 150, 140]]), 1.0);
+    person.ellipse(
+        [0.4, 0.13],
+        [0.11, 0.09],
+        dice.pick(&[[40, 30, 26], [110, 76, 44], [160, 150, 140]]),
+        1.0,
+    );
     if dice.chance(0.4) {
         person.rect(0.58, 0.85, 0.18, 0.3, dice.vary([120, 80, 60], 40.0));
     }
@@ -226,7 +363,13 @@ pub(super) struct GroundPlan {
 
 /// Paints a stretch of road, x along the street; `seeds` are the street's and the stretch's own.
 pub(super) fn paint_ground(plan: &GroundPlan, scale: f32, [street, stretch]: [u64; 2]) -> Painting {
-    let GroundPlan { start, length, half_width, pavement, cobbles } = *plan;
+    let GroundPlan {
+        start,
+        length,
+        half_width,
+        pavement,
+        cobbles,
+    } = *plan;
     let width = half_width * 2.0;
     let mut ground = Painting::new(length, width, scale);
     let mut dice = Dice::new(&[stretch, 11]);
@@ -238,8 +381,18 @@ pub(super) fn paint_ground(plan: &GroundPlan, scale: f32, [street, stretch]: [u6
         ground.rect(0.0, top, length, 0.14, [178, 174, 166]);
     }
     for _ in 0..dice.whole(0..3) {
-        let (x, y) = (dice.real(0.0..length - 4.0), dice.real(pavement + 0.5..width - pavement - 1.5));
-        ground.tint(x, y, dice.real(0.8..4.0), dice.real(0.5..1.4), [40, 40, 42], 0.45);
+        let (x, y) = (
+            dice.real(0.0..length - 4.0),
+            dice.real(pavement + 0.5..width - pavement - 1.5),
+        );
+        ground.tint(
+            x,
+            y,
+            dice.real(0.8..4.0),
+            dice.real(0.5..1.4),
+            [40, 40, 42],
+            0.45,
+        );
     }
     if !cobbles {
         // Stretches are as long as two dashes with their gaps.
@@ -248,7 +401,10 @@ pub(super) fn paint_ground(plan: &GroundPlan, scale: f32, [street, stretch]: [u6
             .for_each(|x| ground.rect(x, half_width - 0.06, length / 4.0, 0.12, [206, 204, 196]));
     }
     if dice.chance(0.7) {
-        let at = [dice.real(1.0..length - 1.0), dice.real(pavement + 0.5..width - pavement - 0.5)];
+        let at = [
+            dice.real(1.0..length - 1.0),
+            dice.real(pavement + 0.5..width - pavement - 0.5),
+        ];
         ground.ellipse(at, [0.35, 0.35], [62, 60, 58], 1.0);
         ground.ellipse(at, [0.28, 0.28], [78, 76, 74], 1.0);
     }
@@ -271,5 +427,9 @@ fn paving(seed: u64, x: f32, y: f32, side: f32) -> f32 {
     let row = (y / side).floor();
     let along = x / side + if row as i32 % 2 == 0 { 0.0 } else { 0.5 };
     let joint = along.fract() < 0.07 || (y / side).fract() < 0.07;
-    if joint { 0.7 } else { 0.9 + 0.2 * lattice(seed ^ 2, along.floor() as i32, row as i32) }
+    if joint {
+        0.7
+    } else {
+        0.9 + 0.2 * lattice(seed ^ 2, along.floor() as i32, row as i32)
+    }
 }

@@ -6,7 +6,9 @@ use std::ops::Range;
 
 /// Folds `parts` into one seed; every order and every value gives another.
 pub(super) fn seed_of(parts: &[u64]) -> u64 {
-    parts.iter().fold(0x9e37_79b9_7f4a_7c15, |state, part| scramble(state ^ part.wrapping_mul(0xd6e8_feb8_6659_fd93)))
+    parts.iter().fold(0x9e37_79b9_7f4a_7c15, |state, part| {
+        scramble(state ^ part.wrapping_mul(0xd6e8_feb8_6659_fd93))
+    })
 }
 
 /// The finaliser of SplitMix64.
@@ -46,11 +48,14 @@ impl Dice {
     /// `colour` with each channel moved by up to `spread` and all together by up to twice that.
     pub(super) fn vary(&mut self, colour: [u8; 3], spread: f32) -> [u8; 3] {
         let together = self.real(-2.0..2.0) * spread;
-        colour.map(|channel| (f32::from(channel) + together + self.real(-1.0..1.0) * spread).clamp(0.0, 255.0) as u8)
+        colour.map(|channel| {
+            (f32::from(channel) + together + self.real(-1.0..1.0) * spread).clamp(0.0, 255.0) as u8
+        })
     }
 }
 
-/// Uniform in 0..1 at an integer point. Asked for millions of times a picture, so 32 bits and two multiplications.
+/// Uniform in 0..1 at an integer point. Asked for millions of times a picture, so 32 bits and two
+/// multiplications.
 pub(super) fn lattice(seed: u64, x: i32, y: i32) -> f32 {
     let mut h = (seed as u32) ^ ((seed >> 32) as u32).rotate_left(13);
     h ^= (x as u32).wrapping_mul(0x9e37_79b1) ^ (y as u32).wrapping_mul(0x85eb_ca77).rotate_left(7);
@@ -88,13 +93,20 @@ mod tests {
 
     #[test]
     fn seeds_differ_by_order_and_value() {
-        let seeds = [seed_of(&[1, 2]), seed_of(&[2, 1]), seed_of(&[1, 2, 0]), seed_of(&[1])];
+        let seeds = [
+            seed_of(&[1, 2]),
+            seed_of(&[2, 1]),
+            seed_of(&[1, 2, 0]),
+            seed_of(&[1]),
+        ];
         assert!((0..4).all(|i| (0..i).all(|j| seeds[i] != seeds[j])));
     }
 
     #[test]
     fn lattice_values_are_spread_evenly_and_neighbours_are_strangers() {
-        let values: Vec<f32> = (0..100).flat_map(|y| (0..100).map(move |x| lattice(3, x - 50, y - 50))).collect();
+        let values: Vec<f32> = (0..100)
+            .flat_map(|y| (0..100).map(move |x| lattice(3, x - 50, y - 50)))
+            .collect();
         let mean = values.iter().sum::<f32>() / 1e4;
         assert!((mean - 0.5).abs() < 0.02, "{mean}");
         for step in [1, 100] {

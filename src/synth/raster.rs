@@ -1,8 +1,8 @@
 //! Textured rectangles in space to pixels, through a pinhole camera with a depth buffer.
 //!
-//! Every rectangle meets the image through one homography, so that two views of a facade are related by a homography
-//! too, as in the world. The inverse of that homography maps a pixel to the rectangle, which makes perspective exact,
-//! needs no clipping and gives the depth as a by-product.
+//! Every rectangle meets the image through one homography, so that two views of a facade are
+//! related by a homography too, as in the world. The inverse of that homography maps a pixel to the
+//! rectangle, which makes perspective exact, needs no clipping and gives the depth as a by-product.
 
 use super::texture::Texture;
 use nalgebra::{Matrix3, Vector3};
@@ -59,15 +59,35 @@ pub(super) struct Camera {
 }
 
 impl Camera {
-    /// Looks along `yaw` (radians from x towards z), tilted up by `pitch`, turned about its axis by `roll`.
-    pub(super) fn new(position: Vec3, yaw: f32, pitch: f32, roll: f32, width: usize, height: usize) -> Self {
-        let forward = Vec3::new(yaw.cos() * pitch.cos(), pitch.sin(), yaw.sin() * pitch.cos());
+    /// Looks along `yaw` (radians from x towards z), tilted up by `pitch`, turned about its axis by
+    /// `roll`.
+    pub(super) fn new(
+        position: Vec3,
+        yaw: f32,
+        pitch: f32,
+        roll: f32,
+        width: usize,
+        height: usize,
+    ) -> Self {
+        let forward = Vec3::new(
+            yaw.cos() * pitch.cos(),
+            pitch.sin(),
+            yaw.sin() * pitch.cos(),
+        );
         let level = Vec3::new(-yaw.sin(), 0.0, yaw.cos());
         let above = level.cross(&forward);
         let right = level * roll.cos() + above * roll.sin();
         let up = above * roll.cos() - level * roll.sin();
         // A horizontal field of view of 66 degrees, as on a phone or a dashboard camera.
-        Self { position, forward, right, up, width, height, focal: width as f32 * 0.77 }
+        Self {
+            position,
+            forward,
+            right,
+            up,
+            width,
+            height,
+            focal: width as f32 * 0.77,
+        }
     }
 
     /// The direction of a pixel, one metre deep.
@@ -77,18 +97,28 @@ impl Camera {
     }
 
     fn offsets(&self, x: f32, y: f32) -> (f32, f32) {
-        ((x - self.width as f32 / 2.0) / self.focal, (y - self.height as f32 / 2.0) / self.focal)
+        (
+            (x - self.width as f32 / 2.0) / self.focal,
+            (y - self.height as f32 / 2.0) / self.focal,
+        )
     }
 
     /// Right, down, depth.
     fn view(&self, point: Vec3) -> Vec3 {
         let offset = point - self.position;
-        Vec3::new(offset.dot(&self.right), -offset.dot(&self.up), offset.dot(&self.forward))
+        Vec3::new(
+            offset.dot(&self.right),
+            -offset.dot(&self.up),
+            offset.dot(&self.forward),
+        )
     }
 
     fn on_image(&self, view: Vec3) -> [f32; 2] {
         let scale = self.focal / view.z;
-        [view.x * scale + self.width as f32 / 2.0, view.y * scale + self.height as f32 / 2.0]
+        [
+            view.x * scale + self.width as f32 / 2.0,
+            view.y * scale + self.height as f32 / 2.0,
+        ]
     }
 
     /// Whether the rectangle may cover any pixel.
@@ -108,7 +138,12 @@ impl Camera {
         let mut bounds = [f32::MAX, f32::MIN, f32::MAX, f32::MIN];
         let mut include = |view: Vec3| {
             let [x, y] = self.on_image(view);
-            bounds = [bounds[0].min(x), bounds[1].max(x), bounds[2].min(y), bounds[3].max(y)];
+            bounds = [
+                bounds[0].min(x),
+                bounds[1].max(x),
+                bounds[2].min(y),
+                bounds[3].max(y),
+            ];
         };
         for (i, &corner) in corners.iter().enumerate() {
             let next = corners[(i + 1) % 4];
@@ -157,7 +192,11 @@ pub(super) struct Frame {
 impl Frame {
     pub(super) fn new(camera: &Camera) -> Self {
         let area = camera.width * camera.height;
-        Self { width: camera.width, light: vec![[0.0; 3]; area], inverse_depth: vec![0.0; area] }
+        Self {
+            width: camera.width,
+            light: vec![[0.0; 3]; area],
+            inverse_depth: vec![0.0; area],
+        }
     }
 
     /// Depth in metres, infinite where nothing was drawn.
@@ -165,30 +204,51 @@ impl Frame {
         1.0 / self.inverse_depth[at]
     }
 
-    /// Draws all of `quads`: opaque ones near to far, so that little is shaded in vain, then cutouts far to near.
-    pub(super) fn draw(&mut self, camera: &Camera, quads: &[Quad], shade: &impl Fn(&Fragment) -> [f32; 3]) {
+    /// Draws all of `quads`: opaque ones near to far, so that little is shaded in vain, then
+    /// cutouts far to near.
+    pub(super) fn draw(
+        &mut self,
+        camera: &Camera,
+        quads: &[Quad],
+        shade: &impl Fn(&Fragment) -> [f32; 3],
+    ) {
         let distance = |quad: &Quad| (quad.centre() - camera.position).norm_squared();
-        let (mut cutouts, mut opaque): (Vec<&Quad>, Vec<&Quad>) = quads.iter().partition(|quad| quad.cutout);
+        let (mut cutouts, mut opaque): (Vec<&Quad>, Vec<&Quad>) =
+            quads.iter().partition(|quad| quad.cutout);
         opaque.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
         cutouts.sort_by(|a, b| distance(b).total_cmp(&distance(a)));
-        opaque.into_iter().chain(cutouts).for_each(|quad| self.draw_quad(camera, quad, shade));
+        opaque
+            .into_iter()
+            .chain(cutouts)
+            .for_each(|quad| self.draw_quad(camera, quad, shade));
     }
 
     fn draw_quad(&mut self, camera: &Camera, quad: &Quad, shade: &impl Fn(&Fragment) -> [f32; 3]) {
-        let Some([left, right, top, bottom]) = camera.bounds(quad.origin, quad.across, quad.down) else { return };
-        let Some(map) = PixelToQuad::new(camera, quad) else { return };
+        let Some([left, right, top, bottom]) = camera.bounds(quad.origin, quad.across, quad.down)
+        else {
+            return;
+        };
+        let Some(map) = PixelToQuad::new(camera, quad) else {
+            return;
+        };
         let mut normal = quad.across.cross(&quad.down).normalize();
         if normal.dot(&(camera.position - quad.origin)) < 0.0 {
             normal = -normal;
         }
         for y in top..bottom {
             for x in left..right {
-                let Some((u, v, inverse_depth)) = map.at(x as f32 + 0.5, y as f32 + 0.5) else { continue };
+                let Some((u, v, inverse_depth)) = map.at(x as f32 + 0.5, y as f32 + 0.5) else {
+                    continue;
+                };
                 let at = y * self.width + x;
                 if inverse_depth <= self.inverse_depth[at] {
                     continue;
                 }
-                let texel = quad.texture.sample(u, v, map.footprint(u, v, inverse_depth, quad.texture.size()));
+                let texel = quad.texture.sample(
+                    u,
+                    v,
+                    map.footprint(u, v, inverse_depth, quad.texture.size()),
+                );
                 if texel.alpha < 0.02 {
                     continue;
                 }
@@ -226,7 +286,9 @@ struct PixelToQuad {
 impl PixelToQuad {
     /// None where the camera lies in the rectangle's plane.
     fn new(camera: &Camera, quad: &Quad) -> Option<Self> {
-        let inverse = Matrix3::from_columns(&[quad.across, quad.down, quad.origin - camera.position]).try_inverse()?;
+        let inverse =
+            Matrix3::from_columns(&[quad.across, quad.down, quad.origin - camera.position])
+                .try_inverse()?;
         let step = 1.0 / camera.focal;
         Some(Self {
             at_origin: inverse * camera.ray(0.0, 0.0),
@@ -245,8 +307,8 @@ impl PixelToQuad {
         ((0.0..=1.0).contains(&u) && (0.0..=1.0).contains(&v)).then_some((u, v, mapped.z))
     }
 
-    /// Texels that a pixel spans: between the longer and the shorter axis of its footprint, so that grazing views are
-    /// neither smeared nor sparkling.
+    /// Texels that a pixel spans: between the longer and the shorter axis of its footprint, so that
+    /// grazing views are neither smeared nor sparkling.
     fn footprint(&self, u: f32, v: f32, inverse_depth: f32, size: [f32; 2]) -> f32 {
         let step = |per: Vec3| {
             let du = (per.x - u * per.z) / inverse_depth * size[0];
@@ -266,8 +328,18 @@ mod tests {
     use super::*;
 
     fn upright(left: Vec3, right: Vec3, height: f32, texture: Arc<Texture>) -> Quad {
-        let (origin, down) = (left + Vec3::new(0.0, height, 0.0), Vec3::new(0.0, -height, 0.0));
-        Quad { origin, across: right - left, down, texture, surface: Surface::Wall, cutout: false }
+        let (origin, down) = (
+            left + Vec3::new(0.0, height, 0.0),
+            Vec3::new(0.0, -height, 0.0),
+        );
+        Quad {
+            origin,
+            across: right - left,
+            down,
+            texture,
+            surface: Surface::Wall,
+            cutout: false,
+        }
     }
 
     /// Left half red, right half green, upper quarter blue.
@@ -277,7 +349,12 @@ mod tests {
         painting.rect(2.0, 0.0, 2.0, 4.0, [0, 255, 0]);
         painting.rect(0.0, 0.0, 4.0, 1.0, [0, 0, 255]);
         let texture = Arc::new(Texture::new(&painting));
-        upright(Vec3::new(6.0, 0.0, -2.0), Vec3::new(8.0, 0.0, 1.464), 4.0, texture)
+        upright(
+            Vec3::new(6.0, 0.0, -2.0),
+            Vec3::new(8.0, 0.0, 1.464),
+            4.0,
+            texture,
+        )
     }
 
     fn camera() -> Camera {
@@ -306,9 +383,16 @@ mod tests {
         let (far, camera) = (quad(), camera());
         let mut wall = Painting::new(1.0, 1.0, 8.0);
         wall.rect(0.0, 0.0, 1.0, 1.0, [255, 255, 255]);
-        let near = upright(Vec3::new(4.0, 0.0, 0.0), Vec3::new(4.0, 0.0, 1.0), 1.0, Arc::new(Texture::new(&wall)));
+        let near = upright(
+            Vec3::new(4.0, 0.0, 0.0),
+            Vec3::new(4.0, 0.0, 1.0),
+            1.0,
+            Arc::new(Texture::new(&wall)),
+        );
         let mut frame = Frame::new(&camera);
-        frame.draw(&camera, &[near.clone(), far.clone()], &|fragment| fragment.albedo);
+        frame.draw(&camera, &[near.clone(), far.clone()], &|fragment| {
+            fragment.albedo
+        });
         let at = |quad: &Quad, u: f32, v: f32| {
             let [x, y] = project(&camera, quad.origin + quad.across * u + quad.down * v);
             frame.light[y as usize * camera.width + x as usize].map(|channel| channel > 0.5)
@@ -324,14 +408,32 @@ mod tests {
     fn quads_behind_or_edge_on_draw_nothing_and_crossing_ones_are_cut() {
         let camera = Camera::new(Vec3::zeros(), 0.0, 0.0, 0.0, 64, 48);
         let texture = quad().texture;
-        let behind = upright(Vec3::new(-3.0, -1.0, -1.0), Vec3::new(-3.0, -1.0, 1.0), 2.0, texture.clone());
-        let edge_on = upright(Vec3::new(1.0, -1.0, 0.0), Vec3::new(3.0, -1.0, 0.0), 2.0, texture.clone());
+        let behind = upright(
+            Vec3::new(-3.0, -1.0, -1.0),
+            Vec3::new(-3.0, -1.0, 1.0),
+            2.0,
+            texture.clone(),
+        );
+        let edge_on = upright(
+            Vec3::new(1.0, -1.0, 0.0),
+            Vec3::new(3.0, -1.0, 0.0),
+            2.0,
+            texture.clone(),
+        );
         let mut frame = Frame::new(&camera);
         frame.draw(&camera, &[behind, edge_on], &|_| [1.0; 3]);
         assert!(frame.light.iter().all(|light| *light == [0.0; 3]));
-        let passing = upright(Vec3::new(-5.0, -1.0, 1.0), Vec3::new(50.0, -1.0, 1.0), 2.0, texture);
+        let passing = upright(
+            Vec3::new(-5.0, -1.0, 1.0),
+            Vec3::new(50.0, -1.0, 1.0),
+            2.0,
+            texture,
+        );
         frame.draw(&camera, &[passing], &|_| [1.0; 3]);
         let lit = |x: usize| frame.light[24 * 64 + x] == [1.0; 3];
-        assert!(lit(63) && lit(40) && !lit(30), "the wall fills the right of the picture");
+        assert!(
+            lit(63) && lit(40) && !lit(30),
+            "the wall fills the right of the picture"
+        );
     }
 }

@@ -1,7 +1,7 @@
 //! The vocabulary of a street: what its houses have in common, and what each one is.
 //!
-//! Streets draw their styles from one small stock and their houses from one street's style, so that neighbours, and
-//! whole streets, look alike at a glance and differ in their details.
+//! Streets draw their styles from one small stock and their houses from one street's style, so that
+//! neighbours, and whole streets, look alike at a glance and differ in their details.
 
 use super::random::Dice;
 
@@ -71,9 +71,21 @@ const WARM_WALLS: [[u8; 3]; 7] = [
     [201, 181, 165],
     [180, 120, 92],
 ];
-const COOL_WALLS: [[u8; 3]; 6] =
-    [[188, 194, 198], [170, 182, 186], [206, 208, 204], [150, 164, 172], [196, 204, 190], [176, 170, 182]];
-const BRICKS: [[u8; 3]; 5] = [[150, 78, 60], [134, 66, 54], [168, 98, 70], [120, 84, 70], [176, 130, 96]];
+const COOL_WALLS: [[u8; 3]; 6] = [
+    [188, 194, 198],
+    [170, 182, 186],
+    [206, 208, 204],
+    [150, 164, 172],
+    [196, 204, 190],
+    [176, 170, 182],
+];
+const BRICKS: [[u8; 3]; 5] = [
+    [150, 78, 60],
+    [134, 66, 54],
+    [168, 98, 70],
+    [120, 84, 70],
+    [176, 130, 96],
+];
 const ACCENTS: [[u8; 3]; 9] = [
     [168, 40, 44],
     [30, 84, 120],
@@ -89,9 +101,21 @@ const ACCENTS: [[u8; 3]; 9] = [
 impl StreetStyle {
     pub(super) fn new(dice: &mut Dice) -> Self {
         let (materials, walls, windows) = match dice.whole(0..4) {
-            0 => (vec![Material::Brick, Material::Brick, Material::Stone], BRICKS.to_vec(), vec![WindowKind::Sash]),
-            1 => (vec![Material::Plaster], WARM_WALLS.to_vec(), vec![WindowKind::Cross, WindowKind::Arched]),
-            2 => (vec![Material::Plaster, Material::Timber], WARM_WALLS.to_vec(), vec![WindowKind::Cross]),
+            0 => (
+                vec![Material::Brick, Material::Brick, Material::Stone],
+                BRICKS.to_vec(),
+                vec![WindowKind::Sash],
+            ),
+            1 => (
+                vec![Material::Plaster],
+                WARM_WALLS.to_vec(),
+                vec![WindowKind::Cross, WindowKind::Arched],
+            ),
+            2 => (
+                vec![Material::Plaster, Material::Timber],
+                WARM_WALLS.to_vec(),
+                vec![WindowKind::Cross],
+            ),
             _ => (
                 vec![Material::Panel, Material::Plaster],
                 COOL_WALLS.to_vec(),
@@ -113,12 +137,26 @@ impl StreetStyle {
 
     pub(super) fn house(&self, dice: &mut Dice) -> HouseStyle {
         let material = dice.pick(&self.materials);
-        let base = if material == Material::Brick { dice.pick(&BRICKS) } else { dice.pick(&self.walls) };
-        let window = if dice.chance(0.8) { dice.pick(&self.windows) } else { WindowKind::Plain };
+        let base = if material == Material::Brick {
+            dice.pick(&BRICKS)
+        } else {
+            dice.pick(&self.walls)
+        };
+        let window = if dice.chance(0.8) {
+            dice.pick(&self.windows)
+        } else {
+            WindowKind::Plain
+        };
         HouseStyle {
             material,
             wall: dice.vary(base, 7.0),
-            trim: dice.pick(&[[236, 232, 222], [222, 214, 200], [90, 84, 80], [240, 240, 238], [120, 100, 84]]),
+            trim: dice.pick(&[
+                [236, 232, 222],
+                [222, 214, 200],
+                [90, 84, 80],
+                [240, 240, 238],
+                [120, 100, 84],
+            ]),
             accent: dice.pick(&ACCENTS),
             roof: dice.pick(&[[128, 66, 52], [92, 88, 90], [110, 78, 66], [70, 74, 80]]),
             window,

@@ -1,4 +1,5 @@
-//! Painted surfaces, kept at every size from full to one texel so that distant ones neither shimmer nor alias.
+//! Painted surfaces, kept at every size from full to one texel so that distant ones neither shimmer
+//! nor alias.
 
 use super::paint::Painting;
 
@@ -30,9 +31,16 @@ pub(super) struct Texture {
 impl Texture {
     pub(super) fn new(painting: &Painting) -> Self {
         let (width, height) = painting.size();
-        let base = Level { width, height, texels: painting.linear_texels() };
+        let base = Level {
+            width,
+            height,
+            texels: painting.linear_texels(),
+        };
         let mut levels = vec![base];
-        while let Some(last) = levels.last().filter(|level| level.width.max(level.height) > 1) {
+        while let Some(last) = levels
+            .last()
+            .filter(|level| level.width.max(level.height) > 1)
+        {
             levels.push(last.halved());
         }
         Self { levels }
@@ -54,7 +62,11 @@ impl Texture {
         }
         let [r, g, b, alpha, glow] = mixed;
         let unmultiply = 1.0 / alpha.max(1e-4);
-        Texel { colour: [r * unmultiply, g * unmultiply, b * unmultiply], alpha, glow }
+        Texel {
+            colour: [r * unmultiply, g * unmultiply, b * unmultiply],
+            alpha,
+            glow,
+        }
     }
 }
 
@@ -63,10 +75,18 @@ impl Level {
         let x = (u * self.width as f32 - 0.5).clamp(0.0, (self.width - 1) as f32);
         let y = (v * self.height as f32 - 0.5).clamp(0.0, (self.height - 1) as f32);
         let (left, top) = (x as usize, y as usize);
-        let (right, bottom) = ((left + 1).min(self.width - 1), (top + 1).min(self.height - 1));
+        let (right, bottom) = (
+            (left + 1).min(self.width - 1),
+            (top + 1).min(self.height - 1),
+        );
         let (fx, fy) = (x - left as f32, y - top as f32);
         let at = |x: usize, y: usize| &self.texels[y * self.width + x];
-        let (a, b, c, d) = (at(left, top), at(right, top), at(left, bottom), at(right, bottom));
+        let (a, b, c, d) = (
+            at(left, top),
+            at(right, top),
+            at(left, bottom),
+            at(right, bottom),
+        );
         std::array::from_fn(|i| {
             let upper = a[i] + (b[i] - a[i]) * fx;
             let lower = c[i] + (d[i] - c[i]) * fx;
@@ -81,10 +101,17 @@ impl Level {
             for x in 0..width {
                 let (x0, y0) = (x * 2, y * 2);
                 let (x1, y1) = ((x0 + 1).min(self.width - 1), (y0 + 1).min(self.height - 1));
-                let four = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| self.texels[y * self.width + x]);
-                texels.push(std::array::from_fn(|i| (four[0][i] + four[1][i] + four[2][i] + four[3][i]) * 0.25));
+                let four = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)]
+                    .map(|(x, y)| self.texels[y * self.width + x]);
+                texels.push(std::array::from_fn(|i| {
+                    (four[0][i] + four[1][i] + four[2][i] + four[3][i]) * 0.25
+                }));
             }
         }
-        Self { width, height, texels }
+        Self {
+            width,
+            height,
+            texels,
+        }
     }
 }

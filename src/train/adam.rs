@@ -31,7 +31,12 @@ impl Adam {
             .into_iter()
             .map(|(name, variable)| {
                 let zeros = variable.zeros_like()?;
-                Ok(Slot { name, variable, first: zeros.clone(), second: zeros })
+                Ok(Slot {
+                    name,
+                    variable,
+                    first: zeros.clone(),
+                    second: zeros,
+                })
             })
             .collect::<Result<_>>()?;
         Ok(Self { slots, steps: 0 })
@@ -43,14 +48,17 @@ impl Adam {
         let correction1 = 1.0 - BETA1.powf(self.steps as f64);
         let correction2 = 1.0 - BETA2.powf(self.steps as f64);
         for slot in &mut self.slots {
-            let Some(gradient) = gradients.get(slot.variable.as_tensor()) else { continue };
+            let Some(gradient) = gradients.get(slot.variable.as_tensor()) else {
+                continue;
+            };
             // Detached: a moment that remembered its graph would keep every past step alive.
             let gradient = gradient.detach();
             slot.first = ((&slot.first * BETA1)? + (&gradient * (1.0 - BETA1))?)?.detach();
             slot.second = ((&slot.second * BETA2)? + (gradient.sqr()? * (1.0 - BETA2))?)?.detach();
             let scale = ((&slot.second / correction2)?.sqrt()? + EPSILON)?;
             let change = ((&slot.first / correction1)? / scale)?;
-            slot.variable.set(&(slot.variable.as_tensor() - (change * rate)?)?.detach())?;
+            slot.variable
+                .set(&(slot.variable.as_tensor() - (change * rate)?)?.detach())?;
         }
         Ok(())
     }

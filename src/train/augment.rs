@@ -1,7 +1,8 @@
-//! Variation of training images: light, colour, and the small shifts of viewpoint that a vehicle's next pass brings.
+//! Variation of training images: light, colour, and the small shifts of viewpoint that a vehicle's
+//! next pass brings.
 //!
-//! Works on normalised tensors, so that decoding and resizing are those of inference. Never mirrors: a mirrored street
-//! is another place.
+//! Works on normalised tensors, so that decoding and resizing are those of inference. Never
+//! mirrors: a mirrored street is another place.
 
 use super::TrainError;
 use crate::image::{DEVIATION, MEAN};
@@ -23,19 +24,30 @@ pub struct Augmentation {
     pub contrast: f32,
     /// Saturation factor within 1 +- this.
     pub saturation: f32,
-    /// Corners of the view move by up to this share of the sides (perspective, zoom, shift and turn at once).
+    /// Corners of the view move by up to this share of the sides (perspective, zoom, shift and turn
+    /// at once).
     pub viewpoint: f32,
 }
 
 impl Default for Augmentation {
     fn default() -> Self {
-        Self { brightness: 0.3, contrast: 0.3, saturation: 0.3, viewpoint: 0.08 }
+        Self {
+            brightness: 0.3,
+            contrast: 0.3,
+            saturation: 0.3,
+            viewpoint: 0.08,
+        }
     }
 }
 
 impl Augmentation {
     /// No variation at all.
-    pub const NONE: Self = Self { brightness: 0.0, contrast: 0.0, saturation: 0.0, viewpoint: 0.0 };
+    pub const NONE: Self = Self {
+        brightness: 0.0,
+        contrast: 0.0,
+        saturation: 0.0,
+        viewpoint: 0.0,
+    };
 
     /// Whether any variation is on.
     pub fn enabled(&self) -> bool {
@@ -43,7 +55,12 @@ impl Augmentation {
     }
 
     pub(super) fn check(&self) -> Result<(), TrainError> {
-        let shares = [self.brightness, self.contrast, self.saturation, self.viewpoint];
+        let shares = [
+            self.brightness,
+            self.contrast,
+            self.saturation,
+            self.viewpoint,
+        ];
         // Corners that move by a quarter of a side or more could cross.
         if shares.iter().all(|share| (0.0..1.0).contains(share)) && self.viewpoint < 0.25 {
             Ok(())
@@ -58,9 +75,18 @@ impl Augmentation {
 /// A variation of `image` decided by `seed` alone.
 pub fn augment(image: &ImageTensor, strength: &Augmentation, seed: u64) -> ImageTensor {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut around_one = |share: f32| if share > 0.0 { rng.random_range(1.0 - share..=1.0 + share) } else { 1.0 };
-    let (brightness, contrast, saturation) =
-        (around_one(strength.brightness), around_one(strength.contrast), around_one(strength.saturation));
+    let mut around_one = |share: f32| {
+        if share > 0.0 {
+            rng.random_range(1.0 - share..=1.0 + share)
+        } else {
+            1.0
+        }
+    };
+    let (brightness, contrast, saturation) = (
+        around_one(strength.brightness),
+        around_one(strength.contrast),
+        around_one(strength.saturation),
+    );
     let mut varied = match strength.viewpoint {
         share if share > 0.0 => {
             let mut shift = || rng.random_range(-share..=share);
@@ -79,8 +105,16 @@ fn recolour(image: &mut ImageTensor, brightness: f32, contrast: f32, saturation:
     let colour = |data: &[f32], channel: usize, pixel: usize| {
         data[channel * pixels + pixel] * DEVIATION[channel] + MEAN[channel]
     };
-    let luma = |data: &[f32], pixel: usize| (0..3).map(|c| LUMA[c] * colour(data, c, pixel)).sum::<f32>();
-    let mean_luma = brightness * (0..pixels).map(|pixel| luma(&image.data, pixel)).sum::<f32>() / pixels as f32;
+    let luma = |data: &[f32], pixel: usize| {
+        (0..3)
+            .map(|c| LUMA[c] * colour(data, c, pixel))
+            .sum::<f32>()
+    };
+    let mean_luma = brightness
+        * (0..pixels)
+            .map(|pixel| luma(&image.data, pixel))
+            .sum::<f32>()
+        / pixels as f32;
     for pixel in 0..pixels {
         let grey = brightness * luma(&image.data, pixel);
         for channel in 0..3 {
@@ -92,14 +126,18 @@ fn recolour(image: &mut ImageTensor, brightness: f32, contrast: f32, saturation:
     }
 }
 
-/// Looks at `image` through a window whose corners are shifted by shares of the sides (top left, top right, bottom
-/// right, bottom left); beyond the border the edge is repeated.
+/// Looks at `image` through a window whose corners are shifted by shares of the sides (top left,
+/// top right, bottom right, bottom left); beyond the border the edge is repeated.
 fn warp(image: &ImageTensor, shifts: &[[f32; 2]; 4]) -> ImageTensor {
     let (width, height) = (image.size.width as usize, image.size.height as usize);
     let (w, h) = (width as f32 - 1.0, height as f32 - 1.0);
     let square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
-    let corners: [[f32; 2]; 4] =
-        std::array::from_fn(|i| [(square[i][0] + shifts[i][0]) * w, (square[i][1] + shifts[i][1]) * h]);
+    let corners: [[f32; 2]; 4] = std::array::from_fn(|i| {
+        [
+            (square[i][0] + shifts[i][0]) * w,
+            (square[i][1] + shifts[i][1]) * h,
+        ]
+    });
     let map = square_to_quad(&corners);
     let mut data = vec![0.0; image.data.len()];
     for y in 0..height {
@@ -112,17 +150,22 @@ fn warp(image: &ImageTensor, shifts: &[[f32; 2]; 4]) -> ImageTensor {
             let (right, bottom) = ((left + 1).min(width - 1), (top + 1).min(height - 1));
             let (fx, fy) = (source_x - left as f32, source_y - top as f32);
             for plane in 0..3 {
-                let at = |row: usize, column: usize| image.data[(plane * height + row) * width + column];
+                let at =
+                    |row: usize, column: usize| image.data[(plane * height + row) * width + column];
                 let upper = at(top, left) * (1.0 - fx) + at(top, right) * fx;
                 let lower = at(bottom, left) * (1.0 - fx) + at(bottom, right) * fx;
                 data[(plane * height + y) * width + x] = upper * (1.0 - fy) + lower * fy;
             }
         }
     }
-    ImageTensor { size: image.size, data }
+    ImageTensor {
+        size: image.size,
+        data,
+    }
 }
 
-/// The homography (h33 = 1) that takes the unit square's corners to a convex quadrilateral (Heckbert, 1989).
+/// The homography (h33 = 1) that takes the unit square's corners to a convex quadrilateral
+/// (Heckbert, 1989).
 fn square_to_quad(quad: &[[f32; 2]; 4]) -> [f32; 8] {
     let [[x0, y0], [x1, y1], [x2, y2], [x3, y3]] = *quad;
     let (dx1, dx2, dx3) = (x1 - x2, x3 - x2, x0 - x1 + x2 - x3);
@@ -130,7 +173,16 @@ fn square_to_quad(quad: &[[f32; 2]; 4]) -> [f32; 8] {
     let determinant = dx1 * dy2 - dx2 * dy1;
     let g = (dx3 * dy2 - dx2 * dy3) / determinant;
     let h = (dx1 * dy3 - dx3 * dy1) / determinant;
-    [x1 - x0 + g * x1, x3 - x0 + h * x3, x0, y1 - y0 + g * y1, y3 - y0 + h * y3, y0, g, h]
+    [
+        x1 - x0 + g * x1,
+        x3 - x0 + h * x3,
+        x0,
+        y1 - y0 + g * y1,
+        y3 - y0 + h * y3,
+        y0,
+        g,
+        h,
+    ]
 }
 
 #[cfg(test)]
@@ -150,14 +202,25 @@ mod tests {
                 }
             }
         }
-        ImageTensor { size: ImageSize { width: 16, height: 12 }, data }
+        ImageTensor {
+            size: ImageSize {
+                width: 16,
+                height: 12,
+            },
+            data,
+        }
     }
 
     #[test]
     fn no_strength_changes_nothing_and_a_seed_repeats() {
         let image = ramp();
         let same = augment(&image, &Augmentation::NONE, 7);
-        assert!(same.data.iter().zip(&image.data).all(|(a, b)| (a - b).abs() < 1e-5));
+        assert!(
+            same.data
+                .iter()
+                .zip(&image.data)
+                .all(|(a, b)| (a - b).abs() < 1e-5)
+        );
         let strength = Augmentation::default();
         assert_eq!(augment(&image, &strength, 7), augment(&image, &strength, 7));
         assert_ne!(augment(&image, &strength, 7), augment(&image, &strength, 8));
@@ -167,7 +230,13 @@ mod tests {
     fn unmoved_corners_leave_the_picture_and_moved_ones_shift_it() {
         let image = ramp();
         let still = warp(&image, &[[0.0; 2]; 4]);
-        assert!(still.data.iter().zip(&image.data).all(|(a, b)| (a - b).abs() < 1e-4));
+        assert!(
+            still
+                .data
+                .iter()
+                .zip(&image.data)
+                .all(|(a, b)| (a - b).abs() < 1e-4)
+        );
         // All corners one column to the right: every pixel shows its right neighbour.
         let moved = warp(&image, &[[1.0 / 15.0, 0.0]; 4]);
         assert!((moved.data[16 * 3 + 4] - image.data[16 * 3 + 5]).abs() < 1e-4);
@@ -175,12 +244,21 @@ mod tests {
 
     #[test]
     fn colours_stay_colours() {
-        let strength = Augmentation { brightness: 0.9, contrast: 0.9, saturation: 0.9, viewpoint: 0.2 };
+        let strength = Augmentation {
+            brightness: 0.9,
+            contrast: 0.9,
+            saturation: 0.9,
+            viewpoint: 0.2,
+        };
         for seed in 0..20 {
             let varied = augment(&ramp(), &strength, seed);
             for (plane, values) in varied.data.chunks(16 * 12).enumerate() {
                 let colours = values.iter().map(|v| v * DEVIATION[plane] + MEAN[plane]);
-                assert!(colours.into_iter().all(|colour| (-1e-4..=1.0001).contains(&colour)));
+                assert!(
+                    colours
+                        .into_iter()
+                        .all(|colour| (-1e-4..=1.0001).contains(&colour))
+                );
             }
         }
     }

@@ -1,7 +1,8 @@
-//! What a run needs to continue bit for bit: weights, moments, the best weights so far, counters, settings.
+//! What a run needs to continue bit for bit: weights, moments, the best weights so far, counters,
+//! settings.
 //!
-//! One safetensors file, written beside and renamed over the last one, so that a run killed while saving keeps the
-//! previous checkpoint.
+//! One safetensors file, written beside and renamed over the last one, so that a run killed while
+//! saving keeps the previous checkpoint.
 
 use super::TrainError;
 use super::adam::Adam;
@@ -41,7 +42,14 @@ impl Checkpoint {
     /// The memory of a run that has not begun.
     pub(super) fn start(adam: &Adam, initial: ValidationRecall) -> Result<Self, TrainError> {
         let best_weights = weights_of(adam)?;
-        Ok(Self { steps: 0, cycles_without_gain: 0, initial, best: initial, last_loss: 0.0, best_weights })
+        Ok(Self {
+            steps: 0,
+            cycles_without_gain: 0,
+            initial,
+            best: initial,
+            last_loss: 0.0,
+            best_weights,
+        })
     }
 
     /// Notes the end of a cycle; keeps the weights if validation is better than ever.
@@ -87,14 +95,23 @@ impl Checkpoint {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
             Err(source) => return Err(TrainError::Io { path, source }),
         };
-        let wrong = |reason: String| TrainError::Checkpoint { path: path.clone(), reason };
-        let (_, header) =
-            safetensors::SafeTensors::read_metadata(&bytes).map_err(|error| wrong(format!("not readable: {error}")))?;
-        let state = header.metadata().as_ref().and_then(|metadata| metadata.get(STATE));
+        let wrong = |reason: String| TrainError::Checkpoint {
+            path: path.clone(),
+            reason,
+        };
+        let (_, header) = safetensors::SafeTensors::read_metadata(&bytes)
+            .map_err(|error| wrong(format!("not readable: {error}")))?;
+        let state = header
+            .metadata()
+            .as_ref()
+            .and_then(|metadata| metadata.get(STATE));
         let state = state.ok_or_else(|| wrong("it is not a training checkpoint".into()))?;
-        let state: State = serde_json::from_str(state).map_err(|error| wrong(format!("its header: {error}")))?;
+        let state: State =
+            serde_json::from_str(state).map_err(|error| wrong(format!("its header: {error}")))?;
         if state.config != *config {
-            return Err(wrong("it belongs to a run with other settings; use them again or another folder".into()));
+            return Err(wrong(
+                "it belongs to a run with other settings; use them again or another folder".into(),
+            ));
         }
         if state.identity != identity {
             let reason = "it belongs to a run on other data or from other weights; use these again or another folder";
@@ -103,11 +120,16 @@ impl Checkpoint {
         let mut tensors = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)?;
         let mut take = |prefix: &str, name: &str, shape: &candle_core::Shape| {
             let key = format!("{prefix}.{name}");
-            let tensor = tensors.remove(&key).ok_or_else(|| wrong(format!("{key} is missing")))?;
+            let tensor = tensors
+                .remove(&key)
+                .ok_or_else(|| wrong(format!("{key} is missing")))?;
             if tensor.shape() == shape {
                 Ok(tensor)
             } else {
-                Err(wrong(format!("{key} has shape {:?}, the model {shape:?}", tensor.shape())))
+                Err(wrong(format!(
+                    "{key} has shape {:?}, the model {shape:?}",
+                    tensor.shape()
+                )))
             }
         };
         let mut best_weights = HashMap::new();
@@ -119,8 +141,22 @@ impl Checkpoint {
             best_weights.insert(slot.name.clone(), take("best", &slot.name, &shape)?);
         }
         adam.steps = state.steps;
-        let State { steps, cycles_without_gain, initial, best, last_loss, .. } = state;
-        Ok(Some(Self { steps, cycles_without_gain, initial, best, last_loss, best_weights }))
+        let State {
+            steps,
+            cycles_without_gain,
+            initial,
+            best,
+            last_loss,
+            ..
+        } = state;
+        Ok(Some(Self {
+            steps,
+            cycles_without_gain,
+            initial,
+            best,
+            last_loss,
+            best_weights,
+        }))
     }
 
     /// Replaces the checkpoint in `folder`.
@@ -133,7 +169,10 @@ impl Checkpoint {
     ) -> Result<(), TrainError> {
         let mut tensors: HashMap<String, Tensor> = HashMap::new();
         for slot in &adam.slots {
-            tensors.insert(format!("weights.{}", slot.name), slot.variable.as_tensor().clone());
+            tensors.insert(
+                format!("weights.{}", slot.name),
+                slot.variable.as_tensor().clone(),
+            );
             tensors.insert(format!("first.{}", slot.name), slot.first.clone());
             tensors.insert(format!("second.{}", slot.name), slot.second.clone());
         }
@@ -150,15 +189,24 @@ impl Checkpoint {
             identity: identity.to_owned(),
         };
         let path = folder.join(FILE);
-        let state = serde_json::to_string(&state)
-            .map_err(|error| TrainError::Checkpoint { path: path.clone(), reason: error.to_string() })?;
-        let bytes = safetensors::serialize(&tensors, Some(HashMap::from([(STATE.to_owned(), state)])))
-            .map_err(|error| TrainError::Checkpoint { path: path.clone(), reason: error.to_string() })?;
+        let state = serde_json::to_string(&state).map_err(|error| TrainError::Checkpoint {
+            path: path.clone(),
+            reason: error.to_string(),
+        })?;
+        let bytes =
+            safetensors::serialize(&tensors, Some(HashMap::from([(STATE.to_owned(), state)])))
+                .map_err(|error| TrainError::Checkpoint {
+                    path: path.clone(),
+                    reason: error.to_string(),
+                })?;
         Ok(write_atomically(&path, &bytes)?)
     }
 }
 
 fn weights_of(adam: &Adam) -> Result<HashMap<String, Tensor>, TrainError> {
     // Copied: `Var::set` writes in place, so a shared tensor would follow the training.
-    adam.slots.iter().map(|slot| Ok((slot.name.clone(), slot.variable.as_tensor().copy()?))).collect()
+    adam.slots
+        .iter()
+        .map(|slot| Ok((slot.name.clone(), slot.variable.as_tensor().copy()?)))
+        .collect()
 }

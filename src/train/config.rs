@@ -60,7 +60,10 @@ impl TrainConfig {
             return Err(TrainError::Setting(format!("{name} must be at least 1")));
         }
         if !(self.margin.is_finite() && self.margin >= 0.0) {
-            return Err(TrainError::Setting(format!("the margin must not be negative, and is {}", self.margin)));
+            return Err(TrainError::Setting(format!(
+                "the margin must not be negative, and is {}",
+                self.margin
+            )));
         }
         Ok(())
     }

@@ -56,7 +56,9 @@ impl TrainError {
         match self {
             Self::Setting(_) | Self::NoTriplets(_) => ErrorCode::InvalidParameter,
             Self::Extract(error) => error.code(),
-            Self::Diverged { .. } | Self::Checkpoint { .. } | Self::Io { .. } | Self::Tensor(_) => ErrorCode::Internal,
+            Self::Diverged { .. } | Self::Checkpoint { .. } | Self::Io { .. } | Self::Tensor(_) => {
+                ErrorCode::Internal
+            }
         }
     }
 }

@@ -24,8 +24,13 @@ pub struct PooledTokens {
 impl PooledTokens {
     /// Takes rows of `dim` values for every query and every database image, in the set's order.
     pub fn new(dim: usize, queries: Vec<f32>, database: Vec<f32>) -> Result<Self, TrainError> {
-        let matrix = |values: Vec<f32>| Tensor::from_vec(values.clone(), (values.len() / dim, dim), &Device::Cpu);
-        Ok(Self { queries: matrix(queries)?, database: matrix(database)? })
+        let matrix = |values: Vec<f32>| {
+            Tensor::from_vec(values.clone(), (values.len() / dim, dim), &Device::Cpu)
+        };
+        Ok(Self {
+            queries: matrix(queries)?,
+            database: matrix(database)?,
+        })
     }
 
     fn side(&self, side: Side) -> &Tensor {
@@ -47,7 +52,12 @@ impl HeadModel {
         let outputs = bias.len();
         let weight = Tensor::from_slice(weight, (outputs, weight.len() / outputs), &Device::Cpu)?;
         let bias = Tensor::from_slice(bias, outputs, &Device::Cpu)?;
-        Ok(Self { weight: Var::from_tensor(&weight)?, bias: Var::from_tensor(&bias)?, training, validation })
+        Ok(Self {
+            weight: Var::from_tensor(&weight)?,
+            bias: Var::from_tensor(&bias)?,
+            training,
+            validation,
+        })
     }
 
     /// Trains in place; afterwards the weights are the best seen.
@@ -59,9 +69,14 @@ impl HeadModel {
         session: Session<'_>,
     ) -> Result<Outcome, TrainError> {
         if config.augmentation.enabled() {
-            return Err(TrainError::Setting("cached tokens cannot be augmented; switch augmentation off".into()));
+            return Err(TrainError::Setting(
+                "cached tokens cannot be augmented; switch augmentation off".into(),
+            ));
         }
-        let bound = Bound { head: self, training };
+        let bound = Bound {
+            head: self,
+            training,
+        };
         run(&bound, training, validation, config, session)
     }
 
@@ -79,16 +94,27 @@ struct Bound<'a> {
 
 impl TripletModel for Bound<'_> {
     fn variables(&self) -> Vec<(String, Var)> {
-        vec![("head.weight".into(), self.head.weight.clone()), ("head.bias".into(), self.head.bias.clone())]
+        vec![
+            ("head.weight".into(), self.head.weight.clone()),
+            ("head.bias".into(), self.head.bias.clone()),
+        ]
     }
 
     fn embed(&self, set: &TripletSet, samples: &[Sample]) -> Result<Tensor, TrainError> {
-        let tokens = if std::ptr::eq(set, self.training) { &self.head.training } else { &self.head.validation };
+        let tokens = if std::ptr::eq(set, self.training) {
+            &self.head.training
+        } else {
+            &self.head.validation
+        };
         // A batch mixes sides; rows are gathered one by one, which is nothing beside the product.
-        let rows: Result<Vec<Tensor>, _> =
-            samples.iter().map(|sample| tokens.side(sample.side).narrow(0, sample.index, 1)).collect();
+        let rows: Result<Vec<Tensor>, _> = samples
+            .iter()
+            .map(|sample| tokens.side(sample.side).narrow(0, sample.index, 1))
+            .collect();
         let rows = Tensor::cat(&rows?, 0)?;
-        let projected = rows.matmul(&self.head.weight.t()?)?.broadcast_add(&self.head.bias)?;
+        let projected = rows
+            .matmul(&self.head.weight.t()?)?
+            .broadcast_add(&self.head.bias)?;
         Ok(normalise_rows(&projected)?)
     }
 

@@ -31,15 +31,29 @@ pub(super) struct TrainLog {
 }
 
 impl TrainLog {
-    /// Opens the log in `folder`, cutting off lines behind `steps`: a cycle that was logged but not checkpointed is
-    /// about to be repeated.
+    /// Opens the log in `folder`, cutting off lines behind `steps`: a cycle that was logged but not
+    /// checkpointed is about to be repeated.
     pub(super) fn open(folder: &Path, steps: u64) -> Result<Self, TrainError> {
         let path = folder.join(FILE);
-        let io = |source| TrainError::Io { path: path.clone(), source };
+        let io = |source| TrainError::Io {
+            path: path.clone(),
+            source,
+        };
         std::fs::create_dir_all(folder).map_err(io)?;
-        let kept: Vec<CycleRecord> =
-            if path.exists() { read_log(folder)?.into_iter().filter(|r| r.step <= steps).collect() } else { vec![] };
-        let file = OpenOptions::new().create(true).write(true).truncate(true).open(&path).map_err(io)?;
+        let kept: Vec<CycleRecord> = if path.exists() {
+            read_log(folder)?
+                .into_iter()
+                .filter(|r| r.step <= steps)
+                .collect()
+        } else {
+            vec![]
+        };
+        let file = OpenOptions::new()
+            .create(true)
+            .write(true)
+            .truncate(true)
+            .open(&path)
+            .map_err(io)?;
         let mut log = Self { path, file };
         for record in &kept {
             log.append(record)?;
@@ -48,7 +62,10 @@ impl TrainLog {
     }
 
     pub(super) fn append(&mut self, record: &CycleRecord) -> Result<(), TrainError> {
-        let io = |source| TrainError::Io { path: self.path.clone(), source };
+        let io = |source| TrainError::Io {
+            path: self.path.clone(),
+            source,
+        };
         let mut line = serde_json::to_vec(record).map_err(|error| io(error.into()))?;
         line.push(b'\n');
         self.file.write_all(&line).map_err(io)
@@ -58,8 +75,13 @@ impl TrainLog {
 /// Every cycle of the run in `folder`; a last line cut off by a kill is passed over.
 pub fn read_log(folder: &Path) -> Result<Vec<CycleRecord>, TrainError> {
     let path = folder.join(FILE);
-    let io = |source| TrainError::Io { path: path.clone(), source };
-    let lines: Result<Vec<String>, _> = BufReader::new(File::open(&path).map_err(io)?).lines().collect();
+    let io = |source| TrainError::Io {
+        path: path.clone(),
+        source,
+    };
+    let lines: Result<Vec<String>, _> = BufReader::new(File::open(&path).map_err(io)?)
+        .lines()
+        .collect();
     let lines = lines.map_err(io)?;
     let mut records = Vec::with_capacity(lines.len());
     for (number, line) in lines.iter().enumerate() {

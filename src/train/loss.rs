@@ -3,7 +3,12 @@
 use candle_core::{Result, Tensor};
 
 /// Mean over a batch of max(|q - p|^2 - |q - n|^2 + margin, 0); all three are `[batch, dim]`.
-pub(super) fn triplet_margin_loss(query: &Tensor, positive: &Tensor, negative: &Tensor, margin: f64) -> Result<Tensor> {
+pub(super) fn triplet_margin_loss(
+    query: &Tensor,
+    positive: &Tensor,
+    negative: &Tensor,
+    margin: f64,
+) -> Result<Tensor> {
     let to_positive = (query - positive)?.sqr()?.sum(1)?;
     let to_negative = (query - negative)?.sqr()?.sum(1)?;
     ((to_positive - to_negative)? + margin)?.relu()?.mean_all()
@@ -29,7 +34,9 @@ mod tests {
     fn loss_is_zero_once_the_negative_is_a_margin_farther() {
         let query = rows(&[[1.0, 0.0, 0.0]]);
         let loss = |negative: [f32; 3]| {
-            let loss = triplet_margin_loss(&query, &rows(&[[1.0, 0.1, 0.0]]), &rows(&[negative]), 0.01).unwrap();
+            let loss =
+                triplet_margin_loss(&query, &rows(&[[1.0, 0.1, 0.0]]), &rows(&[negative]), 0.01)
+                    .unwrap();
             loss.to_scalar::<f32>().unwrap()
         };
         assert_eq!(loss([0.0, 1.0, 0.0]), 0.0);
@@ -43,11 +50,20 @@ mod tests {
         let positive = rows(&[[0.2, 0.3, -0.5], [0.4, -0.6, 0.1]]);
         let negative = rows(&[[0.6, -0.1, 0.3], [0.2, 0.8, -0.2]]);
         let value = |query: &Tensor| {
-            triplet_margin_loss(&normalise_rows(query)?, &normalise_rows(&positive)?, &normalise_rows(&negative)?, 0.01)
+            triplet_margin_loss(
+                &normalise_rows(query)?,
+                &normalise_rows(&positive)?,
+                &normalise_rows(&negative)?,
+                0.01,
+            )
         };
         let query = Var::from_tensor(&rows(&start)).unwrap();
         let gradients = value(query.as_tensor()).unwrap().backward().unwrap();
-        let analytic = gradients.get(query.as_tensor()).unwrap().to_vec2::<f32>().unwrap();
+        let analytic = gradients
+            .get(query.as_tensor())
+            .unwrap()
+            .to_vec2::<f32>()
+            .unwrap();
         let step = 1e-3f32;
         for row in 0..2 {
             for column in 0..3 {
@@ -58,7 +74,11 @@ mod tests {
                 };
                 let numeric = (shifted(step) - shifted(-step)) / f64::from(2.0 * step);
                 let difference = (numeric - f64::from(analytic[row][column])).abs();
-                assert!(difference < 2e-3, "[{row}, {column}]: {numeric} against {}", analytic[row][column]);
+                assert!(
+                    difference < 2e-3,
+                    "[{row}, {column}]: {numeric} against {}",
+                    analytic[row][column]
+                );
             }
         }
     }

@@ -8,9 +8,10 @@
 //!           checkpoint (weights, moments, counters), log line
 //! ```
 //!
-//! A cycle depends only on the checkpoint it starts from and on the seed: every random choice is drawn from
-//! `(seed, step, position)`, and hard negatives are mined anew from the weights the cycle starts with. So a run that
-//! was interrupted continues from its last cycle bit for bit as if it had not been.
+//! A cycle depends only on the checkpoint it starts from and on the seed: every random choice is
+//! drawn from `(seed, step, position)`, and hard negatives are mined anew from the weights the
+//! cycle starts with. So a run that was interrupted continues from its last cycle bit for bit as if
+//! it had not been.
 //!
 //! | module | holds |
 //! |---|---|

@@ -17,7 +17,11 @@ pub struct Schedule {
 
 impl Default for Schedule {
     fn default() -> Self {
-        Self { peak: 5e-4, warm_up: 100, total: 5000 }
+        Self {
+            peak: 5e-4,
+            warm_up: 100,
+            total: 5000,
+        }
     }
 }
 
@@ -36,11 +40,16 @@ impl Schedule {
 
     pub(super) fn check(&self) -> Result<(), TrainError> {
         if !(self.peak.is_finite() && self.peak > 0.0) {
-            return Err(TrainError::Setting(format!("the learning rate must be positive, not {}", self.peak)));
+            return Err(TrainError::Setting(format!(
+                "the learning rate must be positive, not {}",
+                self.peak
+            )));
         }
         if self.warm_up >= self.total {
             let Self { warm_up, total, .. } = self;
-            return Err(TrainError::Setting(format!("{warm_up} steps of warm-up leave nothing of {total} steps")));
+            return Err(TrainError::Setting(format!(
+                "{warm_up} steps of warm-up leave nothing of {total} steps"
+            )));
         }
         Ok(())
     }
@@ -52,7 +61,11 @@ mod tests {
 
     #[test]
     fn the_rate_climbs_then_falls_to_zero() {
-        let schedule = Schedule { peak: 1.0, warm_up: 10, total: 110 };
+        let schedule = Schedule {
+            peak: 1.0,
+            warm_up: 10,
+            total: 110,
+        };
         assert_eq!(schedule.rate(0), 0.1);
         assert_eq!(schedule.rate(9), 1.0);
         assert_eq!(schedule.rate(10), 1.0);
@@ -63,7 +76,21 @@ mod tests {
 
     #[test]
     fn impossible_schedules_are_refused() {
-        assert!(Schedule { warm_up: 5000, ..Schedule::default() }.check().is_err());
-        assert!(Schedule { peak: f64::NAN, ..Schedule::default() }.check().is_err());
+        assert!(
+            Schedule {
+                warm_up: 5000,
+                ..Schedule::default()
+            }
+            .check()
+            .is_err()
+        );
+        assert!(
+            Schedule {
+                peak: f64::NAN,
+                ..Schedule::default()
+            }
+            .check()
+            .is_err()
+        );
     }
 }

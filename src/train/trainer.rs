@@ -1,4 +1,5 @@
-//! The loop: mine, step, validate, keep the best, checkpoint; stop when validation no longer improves.
+//! The loop: mine, step, validate, keep the best, checkpoint; stop when validation no longer
+//! improves.
 
 use super::TrainError;
 use super::adam::Adam;
@@ -80,7 +81,8 @@ pub enum Progress<'a> {
 pub struct Session<'a> {
     /// Folder of the checkpoint and the log; an existing checkpoint is continued.
     pub folder: PathBuf,
-    /// What the run depends on besides its settings: data, starting weights. A checkpoint of another is refused.
+    /// What the run depends on besides its settings: data, starting weights. A checkpoint of
+    /// another is refused.
     pub identity: String,
     /// Called after every batch described, every step and every cycle.
     pub progress: &'a mut dyn FnMut(Progress<'_>),
@@ -96,17 +98,25 @@ pub(super) fn run(
 ) -> Result<Outcome, TrainError> {
     config.check()?;
     let mut adam = Adam::new(model.variables())?;
-    let mut checkpoint = match Checkpoint::resume(&session.folder, config, &session.identity, &mut adam)? {
-        Some(checkpoint) => checkpoint,
-        None => Checkpoint::start(&adam, validate(model, validation, session.progress)?)?,
-    };
+    let mut checkpoint =
+        match Checkpoint::resume(&session.folder, config, &session.identity, &mut adam)? {
+            Some(checkpoint) => checkpoint,
+            None => Checkpoint::start(&adam, validate(model, validation, session.progress)?)?,
+        };
     let mut log = TrainLog::open(&session.folder, checkpoint.steps)?;
     let usable: Vec<usize> = training.usable().collect();
-    while checkpoint.steps < config.schedule.total && checkpoint.cycles_without_gain < config.patience {
+    while checkpoint.steps < config.schedule.total
+        && checkpoint.cycles_without_gain < config.patience
+    {
         let started = Instant::now();
         let until = (checkpoint.steps + config.steps_per_cycle).min(config.schedule.total);
         let range = checkpoint.steps..until;
-        let loss = Cycle { model, set: training, config }.run(&usable, &mut adam, range, session.progress)?;
+        let loss = Cycle {
+            model,
+            set: training,
+            config,
+        }
+        .run(&usable, &mut adam, range, session.progress)?;
         let recall = validate(model, validation, session.progress)?;
         checkpoint.record(&adam, until, loss, recall)?;
         checkpoint.save(&session.folder, config, &session.identity, &adam)?;
@@ -156,11 +166,22 @@ impl Cycle<'_> {
         progress: &mut dyn FnMut(Progress<'_>),
     ) -> Result<f32, TrainError> {
         let Self { model, set, config } = *self;
-        let pool = draw_pool(set.database.len(), config.mining_pool, config.seed ^ range.start.rotate_left(32));
+        let pool = draw_pool(
+            set.database.len(),
+            config.mining_pool,
+            config.seed ^ range.start.rotate_left(32),
+        );
         let draws = self.draw(usable, &pool, range.clone())?;
-        let asked: Vec<u32> =
-            draws.iter().flatten().map(|draw| draw.query).collect::<BTreeSet<_>>().into_iter().collect();
-        let positives = asked.iter().flat_map(|&query| &set.positives[query as usize]);
+        let asked: Vec<u32> = draws
+            .iter()
+            .flatten()
+            .map(|draw| draw.query)
+            .collect::<BTreeSet<_>>()
+            .into_iter()
+            .collect();
+        let positives = asked
+            .iter()
+            .flat_map(|&query| &set.positives[query as usize]);
         let needed = asked.iter().map(|&query| (Side::Query, query));
         let needed = needed.chain(positives.chain(&pool).map(|&index| (Side::Database, index)));
         let embeddings = embed(model, set, needed, "mining", progress)?;
@@ -181,19 +202,36 @@ impl Cycle<'_> {
             }
             total += value;
             adam.step(&loss.backward()?, config.schedule.rate(step))?;
-            progress(Progress::Step { steps: step + 1, loss: value });
+            progress(Progress::Step {
+                steps: step + 1,
+                loss: value,
+            });
         }
         Ok(total / steps as f32)
     }
 
-    /// The triplets of every step of `range`, drawn at random from the queries that have a negative in `pool`. What a
-    /// step draws follows from the seed and its number.
-    fn draw(&self, usable: &[usize], pool: &[u32], range: Range<u64>) -> Result<Vec<Vec<Draw>>, TrainError> {
+    /// The triplets of every step of `range`, drawn at random from the queries that have a negative
+    /// in `pool`. What a step draws follows from the seed and its number.
+    fn draw(
+        &self,
+        usable: &[usize],
+        pool: &[u32],
+        range: Range<u64>,
+    ) -> Result<Vec<Vec<Draw>>, TrainError> {
         let near = &self.set.near;
-        let has_negative = |query: &&usize| pool.iter().any(|index| near[**query].binary_search(index).is_err());
-        let askable: Vec<u32> = usable.iter().filter(has_negative).map(|&query| query as u32).collect();
+        let has_negative = |query: &&usize| {
+            pool.iter()
+                .any(|index| near[**query].binary_search(index).is_err())
+        };
+        let askable: Vec<u32> = usable
+            .iter()
+            .filter(has_negative)
+            .map(|&query| query as u32)
+            .collect();
         if askable.is_empty() {
-            return Err(TrainError::NoTriplets("the mining pool holds no negative of any query".into()));
+            return Err(TrainError::NoTriplets(
+                "the mining pool holds no negative of any query".into(),
+            ));
         }
         let of_step = |step: u64| {
             let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
@@ -208,8 +246,8 @@ impl Cycle<'_> {
         Ok(range.map(of_step).collect())
     }
 
-    /// Queries, positives and negatives: of each query, the positive that looks most alike now (a positive may look the
-    /// other way) and one of its hard negatives.
+    /// Queries, positives and negatives: of each query, the positive that looks most alike now (a
+    /// positive may look the other way) and one of its hard negatives.
     fn batch(
         &self,
         draws: &[Draw],
@@ -221,23 +259,37 @@ impl Cycle<'_> {
             let descriptor = embeddings.of(Side::Query, draw.query)?;
             let positives = embeddings.of_database(&self.set.positives[draw.query as usize])?;
             let distance = |row: &[f32]| squared_distance(descriptor, row);
-            let nearest = positives.iter().min_by(|a, b| distance(a.1).total_cmp(&distance(b.1)));
+            let nearest = positives
+                .iter()
+                .min_by(|a, b| distance(a.1).total_cmp(&distance(b.1)));
             let hard = mined.get(&draw.query).filter(|hard| !hard.is_empty());
             let (Some(&(positive, _)), Some(hard)) = (nearest, hard) else {
-                return Err(TrainError::NoTriplets(format!("query {} lost its positives or negatives", draw.query)));
+                return Err(TrainError::NoTriplets(format!(
+                    "query {} lost its positives or negatives",
+                    draw.query
+                )));
             };
             let negative = hard[(draw.choice % hard.len() as u64) as usize];
-            let parts = [(Side::Query, draw.query), (Side::Database, positive), (Side::Database, negative)];
+            let parts = [
+                (Side::Query, draw.query),
+                (Side::Database, positive),
+                (Side::Database, negative),
+            ];
             for ((role, (side, index)), seed) in roles.iter_mut().zip(parts).zip(draw.variations) {
                 let variation = self.config.augmentation.enabled().then_some(seed);
-                role.push(Sample { side, index: index as usize, variation });
+                role.push(Sample {
+                    side,
+                    index: index as usize,
+                    variation,
+                });
             }
         }
         Ok(roles)
     }
 }
 
-/// Descriptors of `images`, outside the graph; a file is described once, also where it both asks and answers.
+/// Descriptors of `images`, outside the graph; a file is described once, also where it both asks
+/// and answers.
 fn embed(
     model: &dyn TripletModel,
     set: &TripletSet,
@@ -247,10 +299,16 @@ fn embed(
 ) -> Result<Embeddings, TrainError> {
     let (mut samples, mut places, mut rows_of) = (Vec::new(), HashMap::new(), HashMap::new());
     for (side, index) in images.into_iter().collect::<BTreeSet<(Side, u32)>>() {
-        let row = *rows_of.entry(&set.images(side)[index as usize]).or_insert_with(|| {
-            samples.push(Sample { side, index: index as usize, variation: None });
-            samples.len() - 1
-        });
+        let row = *rows_of
+            .entry(&set.images(side)[index as usize])
+            .or_insert_with(|| {
+                samples.push(Sample {
+                    side,
+                    index: index as usize,
+                    variation: None,
+                });
+                samples.len() - 1
+            });
         places.insert((side, index), row);
     }
     let (mut dim, mut rows, mut done) = (0, Vec::new(), 0);
@@ -259,16 +317,21 @@ fn embed(
         dim = descriptors.dim(1)?;
         rows.extend(descriptors.flatten_all()?.to_vec1::<f32>()?);
         done += chunk.len();
-        progress(Progress::Described { purpose, done, of: samples.len() });
+        progress(Progress::Described {
+            purpose,
+            done,
+            of: samples.len(),
+        });
     }
     Ok(Embeddings::new(dim, rows, places))
 }
 
-/// Recall over the usable queries; images that are near without being positives are passed over, as a frame of a
-/// drive would otherwise find itself.
+/// Recall over the usable queries; images that are near without being positives are passed over, as
+/// a frame of a drive would otherwise find itself.
 ///
-/// The rank is the worst that the distances allow: whatever is not farther than the nearest positive comes before it.
-/// Otherwise a model that describes all images alike, or by no number at all, would look perfect and be kept.
+/// The rank is the worst that the distances allow: whatever is not farther than the nearest
+/// positive comes before it. Otherwise a model that describes all images alike, or by no number at
+/// all, would look perfect and be kept.
 fn validate(
     model: &dyn TripletModel,
     set: &TripletSet,
@@ -284,15 +347,24 @@ fn validate(
         let descriptor = embeddings.of(Side::Query, query as u32)?;
         let distance = |index: u32| squared_distance(descriptor, database[index as usize].1);
         // f32::min passes over NaN: a positive without a distance is not found.
-        let nearest = set.positives[query].iter().map(|&index| distance(index)).fold(f32::INFINITY, f32::min);
+        let nearest = set.positives[query]
+            .iter()
+            .map(|&index| distance(index))
+            .fold(f32::INFINITY, f32::min);
         let is_farther = |index: u32| distance(index) > nearest;
         Ok((0..database.len() as u32)
             .filter(|index| set.near[query].binary_search(index).is_err() && !is_farther(*index))
             .count())
     };
     let ranks: Vec<usize> = usable.par_iter().map(rank_of).collect::<Result<_, _>>()?;
-    let recall = |k: usize| 100.0 * ranks.iter().filter(|&&rank| rank < k).count() as f64 / usable.len() as f64;
-    Ok(ValidationRecall { at_1: recall(1), at_5: recall(5), at_10: recall(10) })
+    let recall = |k: usize| {
+        100.0 * ranks.iter().filter(|&&rank| rank < k).count() as f64 / usable.len() as f64
+    };
+    Ok(ValidationRecall {
+        at_1: recall(1),
+        at_5: recall(5),
+        at_10: recall(10),
+    })
 }
 
 #[cfg(test)]

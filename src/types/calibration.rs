@@ -1,8 +1,10 @@
-//! How far a best answer can be trusted: from its score and distance to a probability, and from that to yes or no.
+//! How far a best answer can be trusted: from its score and distance to a probability, and from
+//! that to yes or no.
 //!
-//! A [`Calibration`] holds two curves, because an answer that was not re-ranked has no S and needs an honest
-//! confidence of its own. It says how it was fitted and for which model and re-ranking it holds; anywhere else its
-//! numbers mean nothing. As JSON it is a file, a column of the store and a body of the web surface alike.
+//! A [`Calibration`] holds two curves, because an answer that was not re-ranked has no S and needs
+//! an honest confidence of its own. It says how it was fitted and for which model and re-ranking it
+//! holds; anywhere else its numbers mean nothing. As JSON it is a file, a column of the store and a
+//! body of the web surface alike.
 
 use super::{InvalidValue, ModelId, RerankId};
 use serde::{Deserialize, Serialize};
@@ -19,7 +21,8 @@ const LONGEST_DATA: usize = 200;
 pub struct ConfidenceWeights {
     /// Constant term.
     pub bias: f64,
-    /// Weight of ln(1 + S), not negative: more inliers never make an answer less sure. 0 in a curve without S.
+    /// Weight of ln(1 + S), not negative: more inliers never make an answer less sure. 0 in a curve
+    /// without S.
     #[schema(minimum = 0)]
     pub score: f64,
     /// Weight of the global distance, not positive: a farther answer is never surer.
@@ -28,7 +31,8 @@ pub struct ConfidenceWeights {
 }
 
 impl ConfidenceWeights {
-    /// Probability, 0 to 1, that an answer with this S (`None`: not re-ranked) and Euclidean distance is right.
+    /// Probability, 0 to 1, that an answer with this S (`None`: not re-ranked) and Euclidean
+    /// distance is right.
     pub fn confidence(&self, spatial_score: Option<f64>, global_distance: f64) -> f64 {
         let evidence = self.score * spatial_score.unwrap_or(0.0).max(0.0).ln_1p();
         1.0 / (1.0 + (-(self.bias + evidence + self.distance * global_distance)).exp())
@@ -53,8 +57,8 @@ pub struct ConfidenceCurve {
     /// Share of right answers among those at or above the threshold, cross-validated.
     #[schema(minimum = 0, maximum = 1)]
     pub precision: f64,
-    /// Right answers at or above the threshold, as a share of the queries whose place was in the database,
-    /// cross-validated.
+    /// Right answers at or above the threshold, as a share of the queries whose place was in the
+    /// database, cross-validated.
     #[schema(minimum = 0, maximum = 1)]
     pub recall: f64,
     /// How far confidence and share of right answers lie apart on average, cross-validated.
@@ -69,24 +73,42 @@ impl ConfidenceCurve {
     }
 
     fn check(&self) -> Result<(), InvalidValue> {
-        let ConfidenceWeights { bias, score, distance } = self.weights;
+        let ConfidenceWeights {
+            bias,
+            score,
+            distance,
+        } = self.weights;
         let finite = [("bias", bias), ("score", score), ("distance", distance)];
         if let Some((field, value)) = finite.into_iter().find(|(_, value)| !value.is_finite()) {
-            return Err(InvalidValue::new(field, format!("{value} is not a finite number")));
+            return Err(InvalidValue::new(
+                field,
+                format!("{value} is not a finite number"),
+            ));
         }
         if score < 0.0 {
-            return Err(InvalidValue::new("score", format!("{score} would make more inliers less sure")));
+            return Err(InvalidValue::new(
+                "score",
+                format!("{score} would make more inliers less sure"),
+            ));
         }
         if distance > 0.0 {
-            return Err(InvalidValue::new("distance", format!("{distance} would make farther answers surer")));
+            return Err(InvalidValue::new(
+                "distance",
+                format!("{distance} would make farther answers surer"),
+            ));
         }
         let shares = [
             ("threshold", self.threshold),
             ("precision", self.precision),
             ("recall", self.recall),
-            ("expected_calibration_error", self.expected_calibration_error),
+            (
+                "expected_calibration_error",
+                self.expected_calibration_error,
+            ),
         ];
-        shares.into_iter().try_for_each(|(field, value)| share(field, value))
+        shares
+            .into_iter()
+            .try_for_each(|(field, value)| share(field, value))
     }
 }
 
@@ -136,13 +158,19 @@ impl TryFrom<Unchecked> for Calibration {
             let reason = format!("{} is not known; this release reads {FORMAT}", raw.format);
             return Err(InvalidValue::new("format", reason));
         }
-        Self::new(raw.model, raw.rerank, raw.data, raw.target_precision, [raw.reranked, raw.global])
+        Self::new(
+            raw.model,
+            raw.rerank,
+            raw.data,
+            raw.target_precision,
+            [raw.reranked, raw.global],
+        )
     }
 }
 
 impl Calibration {
-    /// Checks that every number is finite and in its range. `curves` are that of re-ranked answers and that of answers
-    /// by distance alone.
+    /// Checks that every number is finite and in its range. `curves` are that of re-ranked answers
+    /// and that of answers by distance alone.
     pub fn new(
         model: ModelId,
         rerank: RerankId,
@@ -152,15 +180,29 @@ impl Calibration {
     ) -> Result<Self, InvalidValue> {
         let data = data.into();
         if data.chars().count() > LONGEST_DATA {
-            return Err(InvalidValue::new("data", format!("it has more than {LONGEST_DATA} characters")));
+            return Err(InvalidValue::new(
+                "data",
+                format!("it has more than {LONGEST_DATA} characters"),
+            ));
         }
         share("target_precision", target_precision)?;
         curves.iter().try_for_each(ConfidenceCurve::check)?;
         let [reranked, global] = curves;
         if global.weights.score != 0.0 {
-            return Err(InvalidValue::new("global", "its weight of S must be 0: there is no S without re-ranking"));
+            return Err(InvalidValue::new(
+                "global",
+                "its weight of S must be 0: there is no S without re-ranking",
+            ));
         }
-        Ok(Self { format: FORMAT, model, rerank, data, target_precision, reranked, global })
+        Ok(Self {
+            format: FORMAT,
+            model,
+            rerank,
+            data,
+            target_precision,
+            reranked,
+            global,
+        })
     }
 
     /// The model it holds for.
@@ -185,7 +227,11 @@ impl Calibration {
 
     /// The curve for answers that were re-ranked, or for those that were not.
     pub fn curve(&self, reranked: bool) -> &ConfidenceCurve {
-        if reranked { &self.reranked } else { &self.global }
+        if reranked {
+            &self.reranked
+        } else {
+            &self.global
+        }
     }
 }
 
@@ -194,7 +240,10 @@ fn share(field: &'static str, value: f64) -> Result<(), InvalidValue> {
     if (0.0..=1.0).contains(&value) {
         Ok(())
     } else {
-        Err(InvalidValue::new(field, format!("{value} is outside 0 to 1")))
+        Err(InvalidValue::new(
+            field,
+            format!("{value} is outside 0 to 1"),
+        ))
     }
 }
 
@@ -218,7 +267,14 @@ mod tests {
     fn json_survives_and_keeps_its_shape() {
         let read: Calibration = serde_json::from_value(whole()).unwrap();
         assert_eq!(serde_json::to_value(&read).unwrap(), whole());
-        assert_eq!((read.model().as_str(), read.rerank().as_str(), read.curve(true).right), ("m", "r", 90));
+        assert_eq!(
+            (
+                read.model().as_str(),
+                read.rerank().as_str(),
+                read.curve(true).right
+            ),
+            ("m", "r", 90)
+        );
     }
 
     #[test]
@@ -236,16 +292,36 @@ mod tests {
         ] {
             let mut changed = whole();
             *changed.pointer_mut(pointer).unwrap() = value;
-            let error = serde_json::from_value::<Calibration>(changed).unwrap_err().to_string();
+            let error = serde_json::from_value::<Calibration>(changed)
+                .unwrap_err()
+                .to_string();
             assert!(error.contains(named), "{pointer}: {error}");
         }
         let mut more = whole();
         more["reranked"]["comment"] = json!("x");
-        assert!(serde_json::from_value::<Calibration>(more).unwrap_err().to_string().contains("comment"));
-        let endless = ConfidenceWeights { bias: f64::INFINITY, score: 0.0, distance: 0.0 };
+        assert!(
+            serde_json::from_value::<Calibration>(more)
+                .unwrap_err()
+                .to_string()
+                .contains("comment")
+        );
+        let endless = ConfidenceWeights {
+            bias: f64::INFINITY,
+            score: 0.0,
+            distance: 0.0,
+        };
         let read: Calibration = serde_json::from_value(whole()).unwrap();
-        let broken = ConfidenceCurve { weights: endless, ..read.curve(false).clone() };
-        let built = Calibration::new(ModelId::new("m"), RerankId::new("r"), "", 0.9, [broken.clone(), broken]);
+        let broken = ConfidenceCurve {
+            weights: endless,
+            ..read.curve(false).clone()
+        };
+        let built = Calibration::new(
+            ModelId::new("m"),
+            RerankId::new("r"),
+            "",
+            0.9,
+            [broken.clone(), broken],
+        );
         assert!(built.unwrap_err().to_string().contains("bias"));
     }
 

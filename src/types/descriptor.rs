@@ -33,14 +33,27 @@ impl FromStr for ImageSize {
 
     /// Parses `WIDTHxHEIGHT`.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let wrong = || InvalidValue::new("size", format!("{text:?} is not WIDTHxHEIGHT, such as 448x336"));
+        let wrong = || {
+            InvalidValue::new(
+                "size",
+                format!("{text:?} is not WIDTHxHEIGHT, such as 448x336"),
+            )
+        };
         let (width, height) = text.split_once('x').ok_or_else(wrong)?;
-        let (width, height) = (width.parse().map_err(|_| wrong())?, height.parse().map_err(|_| wrong())?);
-        if width == 0 || height == 0 { Err(wrong()) } else { Ok(Self { width, height }) }
+        let (width, height) = (
+            width.parse().map_err(|_| wrong())?,
+            height.parse().map_err(|_| wrong())?,
+        );
+        if width == 0 || height == 0 {
+            Err(wrong())
+        } else {
+            Ok(Self { width, height })
+        }
     }
 }
 
-/// A normalised image ready for the transformer: `[3, height, width]` f32, ImageNet mean and deviation applied.
+/// A normalised image ready for the transformer: `[3, height, width]` f32, ImageNet mean and
+/// deviation applied.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImageTensor {
     /// Width and height in pixels, multiples of the model's patch size.
@@ -91,7 +104,8 @@ impl PatchGrid {
         (along(self.columns), along(self.rows))
     }
 
-    /// Centre, in pixels of the model's input, of the window with row-major `index` in the fused grid at `scale`.
+    /// Centre, in pixels of the model's input, of the window with row-major `index` in the fused
+    /// grid at `scale`.
     pub fn centre(&self, scale: usize, index: usize) -> [f32; 2] {
         let (columns, _) = self.pooled(scale);
         let stride = self.stride.at(scale);
@@ -100,7 +114,8 @@ impl PatchGrid {
     }
 }
 
-/// Key patches of one scale in full precision, by attention descending, ties to the lower index (paper III-C).
+/// Key patches of one scale in full precision, by attention descending, ties to the lower index
+/// (paper III-C).
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ScaleKeyPatches {
     /// Row-major position in the fused grid, `[m]`.
@@ -164,7 +179,9 @@ impl PackedPatches {
         };
         for scale in &patches.scales {
             packed.index.extend(scale.index.iter().map(|&i| i as u16));
-            packed.attention.extend(scale.attention.iter().map(|&a| f16::from_f32(a)));
+            packed
+                .attention
+                .extend(scale.attention.iter().map(|&a| f16::from_f32(a)));
             for descriptor in scale.descriptors.chunks_exact(patches.dim) {
                 let peak = quantise::largest(simd, descriptor).max(f32::MIN_POSITIVE);
                 packed.factor.push(peak / 127.0);
@@ -194,12 +211,15 @@ impl PackedPatches {
 
     /// The scale (1, 2 or 3) of `row`.
     pub fn scale_of(&self, row: usize) -> usize {
-        (1..=SCALES).find(|&scale| self.rows(scale).contains(&row)).unwrap_or(SCALES)
+        (1..=SCALES)
+            .find(|&scale| self.rows(scale).contains(&row))
+            .unwrap_or(SCALES)
     }
 
     /// Centre of the patch in `row`, in pixels of the model's input.
     pub fn centre(&self, row: usize) -> [f32; 2] {
-        self.grid.centre(self.scale_of(row), self.index[row] as usize)
+        self.grid
+            .centre(self.scale_of(row), self.index[row] as usize)
     }
 
     /// Bytes held on the heap.
@@ -213,14 +233,16 @@ impl PackedPatches {
 pub struct Descriptor {
     /// L2-normalised global descriptor, `[256]`: searched.
     pub global: Vec<f32>,
-    /// Pooled patch tokens before the head, L2-normalised, `[dim]` of the head's aggregate (the mean token, unless the
-    /// head says otherwise): kept so that a map can be given a new head of the same aggregate.
+    /// Pooled patch tokens before the head, L2-normalised, `[dim]` of the head's aggregate (the
+    /// mean token, unless the head says otherwise): kept so that a map can be given a new head of
+    /// the same aggregate.
     pub pooled: Vec<f32>,
     /// Key patches: re-ranked.
     pub patches: PackedPatches,
 }
 
-/// A non-empty set of scales matched jointly, such as `1+2` (a row of the paper's table of patch sizes).
+/// A non-empty set of scales matched jointly, such as `1+2` (a row of the paper's table of patch
+/// sizes).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct ScaleSet(u8);
@@ -231,12 +253,18 @@ impl ScaleSet {
         let mut bits = 0;
         for &scale in scales {
             if !(1..=SCALES).contains(&scale) {
-                return Err(InvalidValue::new("scales", format!("{scale} is not a scale; use 1, 2 or 3")));
+                return Err(InvalidValue::new(
+                    "scales",
+                    format!("{scale} is not a scale; use 1, 2 or 3"),
+                ));
             }
             bits |= 1 << (scale - 1);
         }
         if bits == 0 {
-            Err(InvalidValue::new("scales", "a combination needs at least one scale"))
+            Err(InvalidValue::new(
+                "scales",
+                "a combination needs at least one scale",
+            ))
         } else {
             Ok(Self(bits))
         }
@@ -252,10 +280,15 @@ impl ScaleSet {
         (1..=SCALES).filter(move |&scale| self.contains(scale))
     }
 
-    /// The name of its score: `s11`, `s12`, `s23`, `s123`, ... (a lone scale is written twice, as in the paper).
+    /// The name of its score: `s11`, `s12`, `s23`, `s123`, ... (a lone scale is written twice, as
+    /// in the paper).
     pub fn score_name(self) -> String {
         let digits: String = self.scales().map(|scale| scale.to_string()).collect();
-        if digits.len() == 1 { format!("s{digits}{digits}") } else { format!("s{digits}") }
+        if digits.len() == 1 {
+            format!("s{digits}{digits}")
+        } else {
+            format!("s{digits}")
+        }
     }
 
     /// S = s11 + s12 + s23, the best row of the paper's table of patch sizes.
@@ -276,11 +309,14 @@ impl FromStr for ScaleSet {
 
     /// Parses `1`, `1+2`, `2+3`, `1+2+3`, ...
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let scales: Result<Vec<usize>, _> = text.split('+').map(|part| part.trim().parse()).collect();
-        Self::new(
-            &scales
-                .map_err(|_| InvalidValue::new("scales", format!("{text:?} is not scales joined by +, such as 1+2")))?,
-        )
+        let scales: Result<Vec<usize>, _> =
+            text.split('+').map(|part| part.trim().parse()).collect();
+        Self::new(&scales.map_err(|_| {
+            InvalidValue::new(
+                "scales",
+                format!("{text:?} is not scales joined by +, such as 1+2"),
+            )
+        })?)
     }
 }
 
@@ -301,13 +337,27 @@ impl From<ScaleSet> for String {
 mod tests {
     use super::*;
 
-    const GRID: PatchGrid = PatchGrid { columns: 32, rows: 24, patch_px: 14, stride: PoolingStride::Kernel };
+    const GRID: PatchGrid = PatchGrid {
+        columns: 32,
+        rows: 24,
+        patch_px: 14,
+        stride: PoolingStride::Kernel,
+    };
 
     #[test]
     fn pooled_grids_follow_floor_mode() {
-        assert_eq!([1, 2, 3].map(|s| GRID.pooled(s)), [(32, 24), (16, 12), (10, 8)]);
-        let dense = PatchGrid { stride: PoolingStride::One, ..GRID };
-        assert_eq!([1, 2, 3].map(|s| dense.pooled(s)), [(32, 24), (31, 23), (30, 22)]);
+        assert_eq!(
+            [1, 2, 3].map(|s| GRID.pooled(s)),
+            [(32, 24), (16, 12), (10, 8)]
+        );
+        let dense = PatchGrid {
+            stride: PoolingStride::One,
+            ..GRID
+        };
+        assert_eq!(
+            [1, 2, 3].map(|s| dense.pooled(s)),
+            [(32, 24), (31, 23), (30, 22)]
+        );
     }
 
     #[test]
@@ -319,7 +369,12 @@ mod tests {
 
     #[test]
     fn scale_sets_parse_print_and_name_their_score() {
-        for (text, name) in [("1", "s11"), ("1+2", "s12"), ("3+2", "s23"), ("1+2+3", "s123")] {
+        for (text, name) in [
+            ("1", "s11"),
+            ("1+2", "s12"),
+            ("3+2", "s23"),
+            ("1+2+3", "s123"),
+        ] {
             assert_eq!(text.parse::<ScaleSet>().unwrap().score_name(), name);
         }
         for bad in ["", "0", "4", "1+", "a"] {
@@ -330,12 +385,25 @@ mod tests {
     #[test]
     fn quantising_keeps_descriptors_within_half_a_step() {
         let values: Vec<f32> = (0..8).map(|i| (i as f32 - 3.5) / 10.0).collect();
-        let one = ScaleKeyPatches { index: vec![5], attention: vec![1.5], descriptors: values.clone() };
-        let patches = KeyPatches { grid: GRID, dim: 8, scales: [Default::default(), one, Default::default()] };
+        let one = ScaleKeyPatches {
+            index: vec![5],
+            attention: vec![1.5],
+            descriptors: values.clone(),
+        };
+        let patches = KeyPatches {
+            grid: GRID,
+            dim: 8,
+            scales: [Default::default(), one, Default::default()],
+        };
         let packed = PackedPatches::quantise(&patches);
-        assert_eq!((packed.counts, packed.scale_of(0), packed.rows(2)), ([0, 1, 0], 2, 0..1));
+        assert_eq!(
+            (packed.counts, packed.scale_of(0), packed.rows(2)),
+            ([0, 1, 0], 2, 0..1)
+        );
         for (code, value) in packed.codes.iter().zip(&values) {
-            assert!((*code as f32 * packed.factor[0] - value).abs() <= packed.factor[0] / 2.0 + 1e-6);
+            assert!(
+                (*code as f32 * packed.factor[0] - value).abs() <= packed.factor[0] / 2.0 + 1e-6
+            );
         }
     }
 }

@@ -33,13 +33,22 @@ impl GeoPoint {
     pub fn new(lat: f64, lon: f64) -> Result<Self, InvalidValue> {
         // NaN fails `contains`, so it is refused here too.
         if !(-90.0..=90.0).contains(&lat) {
-            return Err(InvalidValue::new("lat", format!("{lat} is outside -90 to 90 degrees")));
+            return Err(InvalidValue::new(
+                "lat",
+                format!("{lat} is outside -90 to 90 degrees"),
+            ));
         }
         if !(-180.0..=180.0).contains(&lon) {
-            return Err(InvalidValue::new("lon", format!("{lon} is outside -180 to 180 degrees")));
+            return Err(InvalidValue::new(
+                "lon",
+                format!("{lon} is outside -180 to 180 degrees"),
+            ));
         }
         // Minus zero is the same place, but not the same bits, and a database may keep it as zero.
-        Ok(Self { lat: lat + 0.0, lon: lon + 0.0 })
+        Ok(Self {
+            lat: lat + 0.0,
+            lon: lon + 0.0,
+        })
     }
 
     /// Latitude in degrees.
@@ -77,7 +86,10 @@ impl GeoCircle {
         if radius_m.is_finite() && radius_m > 0.0 {
             Ok(Self { centre, radius_m })
         } else {
-            Err(InvalidValue::new("radius_m", format!("{radius_m} is not a positive number of metres")))
+            Err(InvalidValue::new(
+                "radius_m",
+                format!("{radius_m} is not a positive number of metres"),
+            ))
         }
     }
 
@@ -96,7 +108,10 @@ impl Heading {
     /// Accepts any finite angle in [-360, 360] and folds it into [0, 360).
     pub fn new(degrees: f64) -> Result<Self, InvalidValue> {
         if !(-360.0..=360.0).contains(&degrees) {
-            return Err(InvalidValue::new("heading", format!("{degrees} is outside -360 to 360 degrees")));
+            return Err(InvalidValue::new(
+                "heading",
+                format!("{degrees} is outside -360 to 360 degrees"),
+            ));
         }
         let folded = degrees.rem_euclid(360.0);
         // A tiny negative angle rounds up to 360 itself.
@@ -130,12 +145,21 @@ mod tests {
     fn there_is_no_minus_zero() {
         let point = GeoPoint::new(-0.0, -0.0).unwrap();
         let heading = Heading::new(-0.0).unwrap();
-        assert!([point.lat(), point.lon(), heading.degrees()].iter().all(|value| value.is_sign_positive()));
+        assert!(
+            [point.lat(), point.lon(), heading.degrees()]
+                .iter()
+                .all(|value| value.is_sign_positive())
+        );
     }
 
     #[test]
     fn positions_out_of_range_or_not_finite_are_refused() {
-        for (lat, lon) in [(95.0, 0.0), (0.0, 181.0), (f64::NAN, 0.0), (0.0, f64::INFINITY)] {
+        for (lat, lon) in [
+            (95.0, 0.0),
+            (0.0, 181.0),
+            (f64::NAN, 0.0),
+            (0.0, f64::INFINITY),
+        ] {
             assert!(GeoPoint::new(lat, lon).is_err(), "{lat} {lon}");
         }
     }

@@ -17,7 +17,8 @@ pub struct InvalidName {
     pub rule: &'static str,
 }
 
-/// Identifies one reference for its whole life. Time-ordered (UUID version 7), so inserts append to indexes.
+/// Identifies one reference for its whole life. Time-ordered (UUID version 7), so inserts append to
+/// indexes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct ReferenceId(Uuid);
@@ -55,17 +56,24 @@ impl FromStr for ReferenceId {
     type Err = InvalidName;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        Uuid::parse_str(text).map(Self).map_err(|_| InvalidName::new("reference id", text, "it must be a UUID"))
+        Uuid::parse_str(text)
+            .map(Self)
+            .map_err(|_| InvalidName::new("reference id", text, "it must be a UUID"))
     }
 }
 
 impl InvalidName {
     fn new(kind: &'static str, value: &str, rule: &'static str) -> Self {
-        Self { kind, value: value.chars().take(80).collect(), rule }
+        Self {
+            kind,
+            value: value.chars().take(80).collect(),
+            rule,
+        }
     }
 }
 
-/// A map: a set of references searched together. 1 to 64 of `A-Z a-z 0-9 . _ -`, starting with a letter or digit.
+/// A map: a set of references searched together. 1 to 64 of `A-Z a-z 0-9 . _ -`, starting with a
+/// letter or digit.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct MapName(String);
@@ -84,7 +92,9 @@ impl FromStr for MapName {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let starts_well = text.starts_with(|c: char| c.is_ascii_alphanumeric());
-        let all_allowed = text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-'));
+        let all_allowed = text
+            .chars()
+            .all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-'));
         if starts_well && all_allowed && text.len() <= 64 {
             Ok(Self(text.to_owned()))
         } else {
@@ -112,7 +122,8 @@ impl fmt::Display for MapName {
     }
 }
 
-/// The caller's own name for a reference, unique within a map. 1 to 256 bytes, no control characters.
+/// The caller's own name for a reference, unique within a map. 1 to 256 bytes, no control
+/// characters.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct ExternalId(String);
@@ -129,7 +140,11 @@ impl FromStr for ExternalId {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         if text.is_empty() || text.len() > 256 || text.chars().any(char::is_control) {
-            return Err(InvalidName::new("external_id", text, "use 1 to 256 bytes without control characters"));
+            return Err(InvalidName::new(
+                "external_id",
+                text,
+                "use 1 to 256 bytes without control characters",
+            ));
         }
         Ok(Self(text.to_owned()))
     }
@@ -154,7 +169,8 @@ impl fmt::Display for ExternalId {
     }
 }
 
-/// What a descriptor depends on: architecture, weight hash, preprocessing and head hash, as one printable string.
+/// What a descriptor depends on: architecture, weight hash, preprocessing and head hash, as one
+/// printable string.
 ///
 /// Two descriptors compare meaningfully only if their `ModelId`s are equal; a map is bound to one.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -204,7 +220,8 @@ impl fmt::Display for RerankId {
     }
 }
 
-/// SHA-256 of an image's bytes as they were sent: decides whether a repeated `external_id` is the same content.
+/// SHA-256 of an image's bytes as they were sent: decides whether a repeated `external_id` is the
+/// same content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ContentHash(pub [u8; 32]);
 

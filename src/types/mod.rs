@@ -10,8 +10,8 @@ mod reference;
 pub use calibration::{Calibration, ConfidenceCurve, ConfidenceWeights};
 pub use deadline::Deadline;
 pub use descriptor::{
-    Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, PackedPatches, PatchGrid, PoolingStride, SCALES,
-    ScaleKeyPatches, ScaleSet,
+    Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, PackedPatches, PatchGrid,
+    PoolingStride, SCALES, ScaleKeyPatches, ScaleSet,
 };
 pub use geo::{GeoCircle, GeoPoint, Heading};
 pub use ids::{ContentHash, ExternalId, InvalidName, MapName, ModelId, ReferenceId, RerankId};
@@ -30,6 +30,9 @@ pub struct InvalidValue {
 impl InvalidValue {
     /// Builds the error for `field`.
     pub fn new(field: &'static str, reason: impl Into<String>) -> Self {
-        Self { field, reason: reason.into() }
+        Self {
+            field,
+            reason: reason.into(),
+        }
     }
 }

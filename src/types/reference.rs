@@ -1,6 +1,9 @@
 //! A reference: one geo-tagged photo of a map, as its metadata.
 
-use super::{ContentHash, Descriptor, ExternalId, GeoCircle, GeoPoint, Heading, MapName, ModelId, ReferenceId};
+use super::{
+    ContentHash, Descriptor, ExternalId, GeoCircle, GeoPoint, Heading, MapName, ModelId,
+    ReferenceId,
+};
 use time::OffsetDateTime;
 
 /// What the map builder says about a photo.
@@ -69,8 +72,13 @@ impl ReferenceFilter {
 
     /// Whether a reference with this location and capture time passes.
     pub fn accepts(&self, location: Option<GeoPoint>, captured_at: Option<OffsetDateTime>) -> bool {
-        self.near.is_none_or(|circle| location.is_some_and(|point| circle.contains(point)))
-            && self.captured_after.is_none_or(|start| captured_at.is_some_and(|time| time >= start))
-            && self.captured_before.is_none_or(|end| captured_at.is_some_and(|time| time < end))
+        self.near
+            .is_none_or(|circle| location.is_some_and(|point| circle.contains(point)))
+            && self
+                .captured_after
+                .is_none_or(|start| captured_at.is_some_and(|time| time >= start))
+            && self
+                .captured_before
+                .is_none_or(|end| captured_at.is_some_and(|time| time < end))
     }
 }

@@ -2,8 +2,8 @@
 
 use half::f16;
 use placeformer::types::{
-    ContentHash, Descriptor, ExternalId, GLOBAL_DIM, GeoPoint, Heading, MapName, ModelId, NewReference, PackedPatches,
-    PatchGrid, PoolingStride, ReferenceFields,
+    ContentHash, Descriptor, ExternalId, GLOBAL_DIM, GeoPoint, Heading, MapName, ModelId,
+    NewReference, PackedPatches, PatchGrid, PoolingStride, ReferenceFields,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -33,20 +33,32 @@ pub fn descriptor(seed: u64, patches: usize, dim: usize) -> Descriptor {
         global: unit_vector(seed, GLOBAL_DIM),
         pooled: unit_vector(seed ^ 0x5555, 384),
         patches: PackedPatches {
-            grid: PatchGrid { columns: 32, rows: 24, patch_px: 14, stride: PoolingStride::Kernel },
+            grid: PatchGrid {
+                columns: 32,
+                rows: 24,
+                patch_px: 14,
+                stride: PoolingStride::Kernel,
+            },
             dim,
             counts,
             index: (0..counts[0] as u16).chain(0..counts[1] as u16).collect(),
-            attention: (0..patches).map(|_| f16::from_f32(random.random_range(1.0..5.0))).collect(),
-            factor: (0..patches).map(|_| random.random_range(0.001..0.01)).collect(),
-            codes: (0..patches * dim).map(|_| random.random_range(-127..=127)).collect(),
+            attention: (0..patches)
+                .map(|_| f16::from_f32(random.random_range(1.0..5.0)))
+                .collect(),
+            factor: (0..patches)
+                .map(|_| random.random_range(0.001..0.01))
+                .collect(),
+            codes: (0..patches * dim)
+                .map(|_| random.random_range(-127..=127))
+                .collect(),
         },
     }
 }
 
 /// A reference of `map` drawn from `seed`, without an external id.
 pub fn reference(map: &MapName, seed: u64) -> NewReference {
-    let captured = OffsetDateTime::from_unix_timestamp(1_700_000_000 + seed as i64 % 100_000).unwrap();
+    let captured =
+        OffsetDateTime::from_unix_timestamp(1_700_000_000 + seed as i64 % 100_000).unwrap();
     NewReference {
         map: map.clone(),
         fields: ReferenceFields {
@@ -54,7 +66,9 @@ pub fn reference(map: &MapName, seed: u64) -> NewReference {
             location: Some(GeoPoint::new(51.0 + (seed % 1000) as f64 * 1e-4, 7.0).unwrap()),
             heading: Some(Heading::new((seed % 360) as f64).unwrap()),
             captured_at: Some(captured),
-            metadata: serde_json::json!({ "seed": seed, "note": "a b" }).as_object().cloned(),
+            metadata: serde_json::json!({ "seed": seed, "note": "a b" })
+                .as_object()
+                .cloned(),
         },
         content_hash: ContentHash::of(&seed.to_le_bytes()),
         model: ModelId::new(MODEL),

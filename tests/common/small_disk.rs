@@ -9,16 +9,23 @@ use tempfile::TempDir;
 pub struct SmallDisk(TempDir);
 
 impl SmallDisk {
-    /// Mounts one. `None`, with a line that says so, where this process may not; where it may, it must work.
+    /// Mounts one. `None`, with a line that says so, where this process may not; where it may, it
+    /// must work.
     pub fn mount() -> Option<Self> {
         let point = tempfile::tempdir().unwrap();
-        let mounting =
-            Command::new("mount").args(["-t", "tmpfs", "-o", "size=10m", "tmpfs"]).arg(point.path()).output().unwrap();
+        let mounting = Command::new("mount")
+            .args(["-t", "tmpfs", "-o", "size=10m", "tmpfs"])
+            .arg(point.path())
+            .output()
+            .unwrap();
         if mounting.status.success() {
             return Some(Self(point));
         }
         let reason = String::from_utf8_lossy(&mounting.stderr).into_owned();
-        assert!(!may_mount(), "this process may mount file systems, and cannot: {reason}");
+        assert!(
+            !may_mount(),
+            "this process may mount file systems, and cannot: {reason}"
+        );
         println!("SKIPPED: this process may not mount a small file system: {reason}");
         None
     }
@@ -43,12 +50,15 @@ impl Drop for SmallDisk {
     }
 }
 
-/// Whether the kernel must let this process mount: being root does not suffice in a container; what counts is the
-/// capability, and that it is one of the whole machine.
+/// Whether the kernel must let this process mount: being root does not suffice in a container; what
+/// counts is the capability, and that it is one of the whole machine.
 fn may_mount() -> bool {
     const CAP_SYS_ADMIN: u64 = 1 << 21;
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
-    let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:")).unwrap();
+    let effective = status
+        .lines()
+        .find_map(|line| line.strip_prefix("CapEff:"))
+        .unwrap();
     let capable = u64::from_str_radix(effective.trim(), 16).unwrap() & CAP_SYS_ADMIN != 0;
     let users = std::fs::read_to_string("/proc/self/uid_map").unwrap();
     capable && users.split_whitespace().eq(["0", "0", "4294967295"])

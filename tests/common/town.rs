@@ -14,24 +14,38 @@ pub const SERVED_SIZE: &str = "{width=84,height=84}";
 /// Whether the model is there; a run without it must say so.
 pub fn has_model() -> bool {
     let path = model_path(Preset::Dinov2Vits14).unwrap();
-    if !path.exists() && std::env::var("PLACEFORMER_TEST_NO_MODEL").is_ok_and(|value| value == "1") {
-        println!("skipped: no model at {} and PLACEFORMER_TEST_NO_MODEL=1", path.display());
+    if !path.exists() && std::env::var("PLACEFORMER_TEST_NO_MODEL").is_ok_and(|value| value == "1")
+    {
+        println!(
+            "skipped: no model at {} and PLACEFORMER_TEST_NO_MODEL=1",
+            path.display()
+        );
         return false;
     }
-    assert!(path.exists(), "no model at {}: run `placeformer model pull dinov2-vits14` first", path.display());
+    assert!(
+        path.exists(),
+        "no model at {}: run `placeformer model pull dinov2-vits14` first",
+        path.display()
+    );
     true
 }
 
 /// The program in `folder`, whatever the environment of the tests says.
 pub fn command(folder: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    command.args(arguments).current_dir(folder).env_remove("PLACEFORMER_WEIGHTS").env_remove("PLACEFORMER_CONFIG");
+    command
+        .args(arguments)
+        .current_dir(folder)
+        .env_remove("PLACEFORMER_WEIGHTS")
+        .env_remove("PLACEFORMER_CONFIG");
     command.env("PLACEFORMER_EXTRACT__INPUT_SIZE", SERVED_SIZE);
     command
 }
 
 pub fn placeformer(folder: &Path, arguments: &[&str]) -> Output {
-    command(folder, arguments).output().expect("the binary was built")
+    command(folder, arguments)
+        .output()
+        .expect("the binary was built")
 }
 
 /// What it prints when it succeeds, to the user and about its progress.
@@ -58,6 +72,11 @@ pub fn refusal(folder: &Path, arguments: &[&str]) -> String {
 /// So many places along a street, some references and a query each, and queries from elsewhere.
 pub fn town(places: &str, views: &str) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    succeeds(folder.path(), &["synth", "--out", "town", "--places", places, "--views", views, "--size", "96x72"]);
+    succeeds(
+        folder.path(),
+        &[
+            "synth", "--out", "town", "--places", places, "--views", views, "--size", "96x72",
+        ],
+    );
     folder
 }

@@ -8,7 +8,13 @@ use std::sync::Arc;
 
 fn backup(data: &Path, out: &Path) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    command.env_remove("PLACEFORMER_CONFIG").arg("backup").arg("--data").arg(data).arg("--out").arg(out);
+    command
+        .env_remove("PLACEFORMER_CONFIG")
+        .arg("backup")
+        .arg("--data")
+        .arg(data)
+        .arg("--out")
+        .arg(out);
     command.output().unwrap()
 }
 
@@ -16,11 +22,22 @@ fn backup(data: &Path, out: &Path) -> Output {
 async fn a_store_is_copied_while_it_is_served_and_after() {
     let data = tempfile::tempdir().unwrap();
     let path = data.path().to_owned();
-    let (live, stopped) = (Arc::new(tempfile::tempdir().unwrap()), Arc::new(tempfile::tempdir().unwrap()));
+    let (live, stopped) = (
+        Arc::new(tempfile::tempdir().unwrap()),
+        Arc::new(tempfile::tempdir().unwrap()),
+    );
     let (to_live, to_stopped) = (live.path().to_owned(), stopped.path().to_owned());
     let outputs = tokio::task::spawn_blocking(move || {
         let server = Server::start(&path, None);
-        let add = |seed: u64| server.post(&format!("/references?map=m&external_id={seed}"), picture(seed)).unwrap().0;
+        let add = |seed: u64| {
+            server
+                .post(
+                    &format!("/references?map=m&external_id={seed}"),
+                    picture(seed),
+                )
+                .unwrap()
+                .0
+        };
         assert_eq!([0, 1, 2].map(add), [201; 3]);
         let of_live = backup(&path, &to_live);
         // The server went on undisturbed, and no earlier copy is ever overwritten.
@@ -31,9 +48,16 @@ async fn a_store_is_copied_while_it_is_served_and_after() {
     });
     let [of_live, again, of_stopped] = outputs.await.unwrap();
     for output in [&of_live, &of_stopped] {
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        assert!(
+            output.status.success(),
+            "{}",
+            String::from_utf8_lossy(&output.stderr)
+        );
     }
-    assert!(!again.status.success() && String::from_utf8_lossy(&again.stderr).contains("exists already"));
+    assert!(
+        !again.status.success()
+            && String::from_utf8_lossy(&again.stderr).contains("exists already")
+    );
     for (copy, references) in [(live, 3), (stopped, 4)] {
         let app = App::open(copy, source(), |_| {});
         assert_eq!(app.count().await, references);

@@ -1,13 +1,16 @@
-//! The bounds hold whatever clients do: leave and come again, ask for more than there is, or be in a hurry.
+//! The bounds hold whatever clients do: leave and come again, ask for more than there is, or be in
+//! a hurry.
 
 use crate::support::{App, FakeSource, Gate, PATIENCE, multipart, picture, until};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use placeformer::store::{
-    Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined, ReferencePatch,
-    SqliteStore, StoreError, VerifyReport,
+    Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined,
+    ReferencePatch, SqliteStore, StoreError, VerifyReport,
 };
-use placeformer::types::{Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId};
+use placeformer::types::{
+    Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
+};
 use serde_json::json;
 use std::path::Path;
 use std::sync::Arc;
@@ -96,14 +99,20 @@ async fn abandoned_references_are_bounded_too() {
     assert_eq!(app.source.describing.peak(), 1);
     app.source.describing.gate.open();
     app.post_png("/references?map=m", 11).await.created();
-    assert_eq!(app.count().await, 1, "what was abandoned before its commit is not stored");
+    assert_eq!(
+        app.count().await,
+        1,
+        "what was abandoned before its commit is not stored"
+    );
 }
 
 // ---------------------------------------------------------------- bytes under way
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_body_counts_until_it_is_decoded_even_if_its_client_has_left() {
-    let app = Arc::new(App::with(|config| config.http.max_buffered_bytes = 192 << 10));
+    let app = Arc::new(App::with(|config| {
+        config.http.max_buffered_bytes = 192 << 10
+    }));
     app.post_png("/references?map=m", 0).await.created();
     app.source.decoding.gate.close();
     let leaving = {
@@ -113,18 +122,25 @@ async fn a_body_counts_until_it_is_decoded_even_if_its_client_has_left() {
     until("decoding", || app.source.decoding.inside() == 1).await;
     leaving.abort();
     until("a client that left", || leaving.is_finished()).await;
-    app.post_bytes("/query?map=m", &[7; 100 << 10]).await.problem("overloaded");
+    app.post_bytes("/query?map=m", &[7; 100 << 10])
+        .await
+        .problem("overloaded");
     app.source.decoding.gate.open();
     until("the end of decoding", || app.source.decoding.inside() == 0).await;
     let began = std::time::Instant::now();
     while app.post_bytes("/query?map=m", &[7; 100 << 10]).await.json["code"] == "overloaded" {
-        assert!(began.elapsed() < PATIENCE, "the bytes were never given back");
+        assert!(
+            began.elapsed() < PATIENCE,
+            "the bytes were never given back"
+        );
     }
     // Given back before the queue for the model, not only with the answer.
     app.source.describing.gate.close();
     let waiting = query(&app, 1, "");
     until("an extraction", || app.source.describing.inside() == 1).await;
-    app.post_bytes("/query?map=m", &[7; 180 << 10]).await.problem("unsupported_media_type");
+    app.post_bytes("/query?map=m", &[7; 180 << 10])
+        .await
+        .problem("unsupported_media_type");
     app.source.describing.gate.open();
     waiting.await.unwrap().ok();
 }
@@ -135,18 +151,30 @@ async fn every_copy_of_an_image_is_charged() {
     let app = App::with(|config| config.http.max_buffered_bytes = 256 << 10);
     app.post_png("/references?map=m", 0).await.created();
     let image = vec![7; 150 << 10];
-    app.post_bytes("/query?map=m", &image).await.problem("unsupported_media_type");
+    app.post_bytes("/query?map=m", &image)
+        .await
+        .problem("unsupported_media_type");
     let encoded = json!({"map": "m", "image": STANDARD.encode(&image)}).to_string();
-    app.post("/query", "application/json", encoded).await.problem("overloaded");
+    app.post("/query", "application/json", encoded)
+        .await
+        .problem("overloaded");
     let (kind, form) = multipart(&[("image", &image), ("json", br#"{"map": "m"}"#)]);
     app.post("/query", &kind, form).await.problem("overloaded");
-    assert_eq!(app.metric("placeformer_rejected_total{reason=\"body_memory\"}").await, 2.0);
+    assert_eq!(
+        app.metric("placeformer_rejected_total{reason=\"body_memory\"}")
+            .await,
+        2.0
+    );
     // A smaller one fits with its copies, again and again: all of it is given back.
     let image = picture(0);
-    let escaped = json!({"map": "m", "image": STANDARD.encode(&image)}).to_string().replace('/', "\\/");
+    let escaped = json!({"map": "m", "image": STANDARD.encode(&image)})
+        .to_string()
+        .replace('/', "\\/");
     let (kind, form) = multipart(&[("image", &image), ("json", br#"{"map": "m"}"#)]);
     for _ in 0..20 {
-        app.post("/query", "application/json", escaped.clone()).await.ok();
+        app.post("/query", "application/json", escaped.clone())
+            .await
+            .ok();
         app.post("/query", &kind, form.clone()).await.ok();
     }
 }
@@ -154,13 +182,22 @@ async fn every_copy_of_an_image_is_charged() {
 #[tokio::test]
 async fn json_beside_the_image_is_short() {
     let app = App::new();
-    let many = format!("{{\"map\": \"m\", \"image\": \"AAAA\", \"metadata\": {{\"a\": [0{}]}}}}", ",0".repeat(200_000));
-    app.post("/references", "application/json", many.clone()).await.problem("body_too_large");
+    let many = format!(
+        "{{\"map\": \"m\", \"image\": \"AAAA\", \"metadata\": {{\"a\": [0{}]}}}}",
+        ",0".repeat(200_000)
+    );
+    app.post("/references", "application/json", many.clone())
+        .await
+        .problem("body_too_large");
     let (kind, form) = multipart(&[("image", &picture(1)), ("json", many.as_bytes())]);
-    app.post("/references", &kind, form).await.problem("body_too_large");
+    app.post("/references", &kind, form)
+        .await
+        .problem("body_too_large");
     let members: String = (0..60_000).map(|n| format!("\"{n}\":0,")).collect();
     let wide = format!("{{{members}\"map\": \"m\", \"image\": \"AAAA\"}}");
-    app.post("/references", "application/json", wide).await.problem("body_too_large");
+    app.post("/references", "application/json", wide)
+        .await
+        .problem("body_too_large");
     assert_eq!(app.count().await, 0);
 }
 
@@ -188,7 +225,11 @@ impl PlaceStore for Gated {
     fn get(&self, id: ReferenceId) -> Result<Reference, StoreError> {
         self.inner.get(id)
     }
-    fn find_external(&self, map: &MapName, external_id: &ExternalId) -> Result<Option<Reference>, StoreError> {
+    fn find_external(
+        &self,
+        map: &MapName,
+        external_id: &ExternalId,
+    ) -> Result<Option<Reference>, StoreError> {
         self.inner.find_external(map, external_id)
     }
     fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, StoreError> {
@@ -198,8 +239,14 @@ impl PlaceStore for Gated {
         self.wait();
         self.inner.delete(id)
     }
-    fn list(&self, map: Option<&MapName>, after: Option<ReferenceId>, limit: usize) -> Result<Page, StoreError> {
-        self.inner.scan_globals(&"m".parse().unwrap(), &mut |_| self.wait())?;
+    fn list(
+        &self,
+        map: Option<&MapName>,
+        after: Option<ReferenceId>,
+        limit: usize,
+    ) -> Result<Page, StoreError> {
+        self.inner
+            .scan_globals(&"m".parse().unwrap(), &mut |_| self.wait())?;
         self.inner.list(map, after, limit)
     }
     fn maps(&self) -> Result<Vec<MapInfo>, StoreError> {
@@ -217,16 +264,29 @@ impl PlaceStore for Gated {
     fn patches(&self, id: ReferenceId) -> Result<PackedPatches, StoreError> {
         self.inner.patches(id)
     }
-    fn scan_globals(&self, map: &MapName, visit: &mut dyn FnMut(GlobalRow)) -> Result<(), StoreError> {
+    fn scan_globals(
+        &self,
+        map: &MapName,
+        visit: &mut dyn FnMut(GlobalRow),
+    ) -> Result<(), StoreError> {
         self.inner.scan_globals(map, visit)
     }
-    fn replace_globals(&self, map: &MapName, head: NewHead, exchange: &mut dyn HeadExchange) -> Result<(), StoreError> {
+    fn replace_globals(
+        &self,
+        map: &MapName,
+        head: NewHead,
+        exchange: &mut dyn HeadExchange,
+    ) -> Result<(), StoreError> {
         self.inner.replace_globals(map, head, exchange)
     }
     fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError> {
         self.inner.head(map)
     }
-    fn set_calibration(&self, map: &MapName, calibration: Option<Calibration>) -> Result<(), StoreError> {
+    fn set_calibration(
+        &self,
+        map: &MapName,
+        calibration: Option<Calibration>,
+    ) -> Result<(), StoreError> {
         self.inner.set_calibration(map, calibration)
     }
     fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError> {
@@ -258,14 +318,28 @@ async fn gated() -> Flooded {
     let (gate, arrived) = (Arc::new(Gate::default()), Arc::new(AtomicUsize::new(0)));
     let (at_gate, arriving) = (gate.clone(), arrived.clone());
     let app = App::around(
-        move |inner| Arc::new(Gated { inner, gate: at_gate, arrived: arriving }),
+        move |inner| {
+            Arc::new(Gated {
+                inner,
+                gate: at_gate,
+                arrived: arriving,
+            })
+        },
         Arc::new(tempfile::tempdir().unwrap()),
         FakeSource::new("fake-1"),
         |config| config.pipeline.max_wait_ms = 300,
     );
-    let id = app.post_png("/references?map=m", 0).await.created()["id"].as_str().unwrap().to_owned();
+    let id = app.post_png("/references?map=m", 0).await.created()["id"]
+        .as_str()
+        .unwrap()
+        .to_owned();
     gate.close();
-    Flooded { app: Arc::new(app), gate, arrived, id }
+    Flooded {
+        app: Arc::new(app),
+        gate,
+        arrived,
+        id,
+    }
 }
 
 /// More than the runtime has threads for blocking work.
@@ -273,7 +347,9 @@ const FLOOD: usize = 600;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn slow_listings_keep_no_query_waiting() {
-    let Flooded { app, gate, arrived, .. } = gated().await;
+    let Flooded {
+        app, gate, arrived, ..
+    } = gated().await;
     let listings: Vec<_> = (0..FLOOD)
         .map(|_| {
             let app = app.clone();
@@ -281,14 +357,27 @@ async fn slow_listings_keep_no_query_waiting() {
         })
         .collect();
     until("a turn for some, and a refusal for the rest", || {
-        listings.iter().filter(|listing| listing.is_finished()).count() == FLOOD - 4
+        listings
+            .iter()
+            .filter(|listing| listing.is_finished())
+            .count()
+            == FLOOD - 4
     })
     .await;
     assert_eq!(arrived.load(Ordering::SeqCst), 4, "listings at the store");
-    let found = timeout(PATIENCE, app.post_png("/query?map=m", 0)).await.expect("the query waits for the listings");
+    let found = timeout(PATIENCE, app.post_png("/query?map=m", 0))
+        .await
+        .expect("the query waits for the listings");
     assert_eq!(found.ok()["results"].as_array().unwrap().len(), 1);
-    let refused = timeout(PATIENCE, app.metric("placeformer_rejected_total{reason=\"store_busy\"}")).await;
-    assert_eq!(refused.expect("the metrics wait for the listings"), (FLOOD - 4) as f64);
+    let refused = timeout(
+        PATIENCE,
+        app.metric("placeformer_rejected_total{reason=\"store_busy\"}"),
+    )
+    .await;
+    assert_eq!(
+        refused.expect("the metrics wait for the listings"),
+        (FLOOD - 4) as f64
+    );
     gate.open();
     let mut answered = 0;
     for listing in listings {
@@ -305,7 +394,12 @@ async fn slow_listings_keep_no_query_waiting() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn slow_deletions_keep_neither_queries_nor_listings_waiting() {
-    let Flooded { app, gate, arrived, id } = gated().await;
+    let Flooded {
+        app,
+        gate,
+        arrived,
+        id,
+    } = gated().await;
     let deletions: Vec<_> = (0..FLOOD)
         .map(|_| {
             let (app, path) = (app.clone(), format!("/references/{id}"));
@@ -314,12 +408,22 @@ async fn slow_deletions_keep_neither_queries_nor_listings_waiting() {
         .collect();
     // All deletions of one map wait for each other, the first of them at the gate.
     until("a refusal for all without a turn", || {
-        deletions.iter().filter(|deletion| deletion.is_finished()).count() == FLOOD - 16
+        deletions
+            .iter()
+            .filter(|deletion| deletion.is_finished())
+            .count()
+            == FLOOD - 16
     })
     .await;
     assert_eq!(arrived.load(Ordering::SeqCst), 1, "deletions at the store");
-    timeout(PATIENCE, app.post_png("/query?map=m", 0)).await.expect("the query waits for the deletions").ok();
-    timeout(PATIENCE, app.get("/maps")).await.expect("the listing waits for the deletions").ok();
+    timeout(PATIENCE, app.post_png("/query?map=m", 0))
+        .await
+        .expect("the query waits for the deletions")
+        .ok();
+    timeout(PATIENCE, app.get("/maps"))
+        .await
+        .expect("the listing waits for the deletions")
+        .ok();
     gate.open();
     let mut deleted = 0;
     for deletion in deletions {
@@ -335,9 +439,14 @@ async fn the_deadline_is_kept_in_the_queue_and_during_the_work() {
     for stage in ["decoding", "describing"] {
         let app = Arc::new(App::with(|config| config.pipeline.deadline_ms = 400));
         app.post_png("/references?map=m", 0).await.created();
-        let step = if stage == "decoding" { &app.source.decoding } else { &app.source.describing };
+        let step = if stage == "decoding" {
+            &app.source.decoding
+        } else {
+            &app.source.describing
+        };
         step.gate.close();
-        // These take the places at work, as far as the door lets so many in at once; the others wait for a turn.
+        // These take the places at work, as far as the door lets so many in at once; the others
+        // wait for a turn.
         let busy = cores().min(5);
         let working: Vec<_> = (0..busy as u64).map(|seed| query(&app, seed, "")).collect();
         until(stage, || step.inside() > 0).await;
@@ -345,15 +454,23 @@ async fn the_deadline_is_kept_in_the_queue_and_during_the_work() {
         let matching = timeout(PATIENCE, app.post("/match", &kind, pair));
         let waiting = timeout(PATIENCE, app.post_png("/query?map=m&deadline_ms=100", 9));
         let (matching, waiting) = tokio::join!(matching, waiting);
-        matching.expect("the match waited for its turn").problem("deadline_exceeded");
-        waiting.expect("the query waited for its turn").problem("deadline_exceeded");
+        matching
+            .expect("the match waited for its turn")
+            .problem("deadline_exceeded");
+        waiting
+            .expect("the query waited for its turn")
+            .problem("deadline_exceeded");
         for query in working {
-            let query = timeout(PATIENCE, query).await.expect("the query waited for its own work");
+            let query = timeout(PATIENCE, query)
+                .await
+                .expect("the query waited for its own work");
             query.unwrap().problem("deadline_exceeded");
         }
         assert!(step.inside() > 0, "nothing was let through the gate");
         step.gate.open();
-        let late = app.metric("placeformer_rejected_total{reason=\"deadline\"}").await;
+        let late = app
+            .metric("placeformer_rejected_total{reason=\"deadline\"}")
+            .await;
         assert_eq!(late, (busy + 2) as f64, "{stage}");
         app.drained().await;
         app.post_png("/query?map=m", 0).await.ok();

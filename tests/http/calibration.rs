@@ -20,12 +20,15 @@ fn calibration() -> Value {
 
 async fn put(app: &App, path: &str, body: &Value) -> Answer {
     let request = Request::put(path).header("content-type", "application/json");
-    app.send(request.body(Body::from(body.to_string())).unwrap()).await
+    app.send(request.body(Body::from(body.to_string())).unwrap())
+        .await
 }
 
 async fn unmatched(app: &App) -> u64 {
     let text = app.get("/metrics").await.text;
-    let line = text.lines().find_map(|line| line.strip_prefix("placeformer_query_unmatched_total "));
+    let line = text
+        .lines()
+        .find_map(|line| line.strip_prefix("placeformer_query_unmatched_total "));
     line.unwrap().parse().unwrap()
 }
 
@@ -37,20 +40,37 @@ async fn answers_are_trusted_as_the_maps_calibration_says() {
     }
     // The model of this test ships none: nothing is guessed.
     let plain = app.post_png("/query?map=m", 1).await;
-    assert_eq!((&plain.ok()["matched"], &plain.json["confidence"]), (&Value::Null, &Value::Null));
+    assert_eq!(
+        (&plain.ok()["matched"], &plain.json["confidence"]),
+        (&Value::Null, &Value::Null)
+    );
     assert_eq!(app.get("/info").await.ok()["calibration"], Value::Null);
     assert_eq!(unmatched(&app).await, 0);
 
-    assert_eq!(put(&app, "/maps/m/calibration", &calibration()).await.ok(), &calibration());
+    assert_eq!(
+        put(&app, "/maps/m/calibration", &calibration()).await.ok(),
+        &calibration()
+    );
     assert_eq!(app.get("/maps/m").await.ok()["calibration"], calibration());
-    assert_eq!(app.get("/maps").await.ok()["maps"][0]["calibration"], calibration());
+    assert_eq!(
+        app.get("/maps").await.ok()["maps"][0]["calibration"],
+        calibration()
+    );
     for (query, known) in [("map=m", true), ("map=m&rerank=false", true)] {
         let same = app.post_png(&format!("/query?{query}"), 1).await;
         assert_eq!(same.ok()["matched"], known, "{}", same.text);
-        assert!(same.json["confidence"].as_f64().unwrap() >= 0.75, "{}", same.text);
+        assert!(
+            same.json["confidence"].as_f64().unwrap() >= 0.75,
+            "{}",
+            same.text
+        );
         let strange = app.post_png(&format!("/query?{query}"), 77).await;
         assert_eq!(strange.ok()["matched"], false, "{}", strange.text);
-        assert!(strange.json["confidence"].as_f64().unwrap() < 0.75, "{}", strange.text);
+        assert!(
+            strange.json["confidence"].as_f64().unwrap() < 0.75,
+            "{}",
+            strange.text
+        );
     }
     assert_eq!(unmatched(&app).await, 2);
 
@@ -58,17 +78,27 @@ async fn answers_are_trusted_as_the_maps_calibration_says() {
     assert_eq!((removed.status.as_u16(), removed.text.as_str()), (204, ""));
     assert_eq!(app.delete("/maps/m/calibration").await.status, 204);
     assert_eq!(app.get("/maps/m").await.ok()["calibration"], Value::Null);
-    assert_eq!(app.post_png("/query?map=m", 77).await.ok()["matched"], Value::Null);
+    assert_eq!(
+        app.post_png("/query?map=m", 77).await.ok()["matched"],
+        Value::Null
+    );
     assert_eq!(unmatched(&app).await, 2);
 }
 
 #[tokio::test]
 async fn no_result_is_no_match_with_or_without_a_calibration() {
     let app = App::new();
-    app.post_png("/references?map=m&lat=50&lon=8", 1).await.created();
+    app.post_png("/references?map=m&lat=50&lon=8", 1)
+        .await
+        .created();
     for _ in 0..2 {
-        let nowhere = app.post_png("/query?map=m&near=-50,100&radius_m=10", 1).await;
-        assert_eq!((&nowhere.ok()["matched"], &nowhere.json["confidence"]), (&json!(false), &json!(0.0)));
+        let nowhere = app
+            .post_png("/query?map=m&near=-50,100&radius_m=10", 1)
+            .await;
+        assert_eq!(
+            (&nowhere.ok()["matched"], &nowhere.json["confidence"]),
+            (&json!(false), &json!(0.0))
+        );
         put(&app, "/maps/m/calibration", &calibration()).await.ok();
     }
     assert_eq!(unmatched(&app).await, 2);
@@ -85,7 +115,10 @@ async fn a_calibration_outlives_a_restart_and_not_its_map() {
     assert_eq!(app.post_png("/query?map=m", 1).await.ok()["matched"], true);
     app.delete("/maps/m").await.ok();
     app.post_png("/references?map=m", 1).await.created();
-    assert_eq!(app.post_png("/query?map=m", 1).await.ok()["matched"], Value::Null);
+    assert_eq!(
+        app.post_png("/query?map=m", 1).await.ok()["matched"],
+        Value::Null
+    );
 }
 
 #[tokio::test]
@@ -97,7 +130,10 @@ async fn calibrations_for_something_else_are_refused_with_both_identities() {
         *changed.pointer_mut(field).unwrap() = value;
         changed
     };
-    for (field, given, own) in [("/model", "fake-2", "fake-1"), ("/rerank", "1:t2", "1,1+2,2+3:t1.5")] {
+    for (field, given, own) in [
+        ("/model", "fake-2", "fake-1"),
+        ("/rerank", "1:t2", "1,1+2,2+3:t1.5"),
+    ] {
         let refused = put(&app, "/maps/m/calibration", &with(field, json!(given))).await;
         let detail = refused.problem("calibration_mismatch");
         assert!(detail.contains(given) && detail.contains(own), "{detail}");
@@ -116,11 +152,25 @@ async fn calibrations_for_something_else_are_refused_with_both_identities() {
     let endless = calibration().to_string().replacen("-12.0", "1e999", 1);
     assert!(endless.contains("1e999"));
     let request = Request::put("/maps/m/calibration").header("content-type", "application/json");
-    app.send(request.body(Body::from(endless)).unwrap()).await.problem("malformed_request");
-    put(&app, "/maps/none/calibration", &calibration()).await.problem("map_not_found");
-    put(&app, "/maps/a b/calibration".replace(' ', "%20").as_str(), &calibration()).await.problem("map_not_found");
-    app.delete("/maps/none/calibration").await.problem("map_not_found");
-    app.get("/maps/m/calibration").await.problem("method_not_allowed");
+    app.send(request.body(Body::from(endless)).unwrap())
+        .await
+        .problem("malformed_request");
+    put(&app, "/maps/none/calibration", &calibration())
+        .await
+        .problem("map_not_found");
+    put(
+        &app,
+        "/maps/a b/calibration".replace(' ', "%20").as_str(),
+        &calibration(),
+    )
+    .await
+    .problem("map_not_found");
+    app.delete("/maps/none/calibration")
+        .await
+        .problem("map_not_found");
+    app.get("/maps/m/calibration")
+        .await
+        .problem("method_not_allowed");
     assert_eq!(app.get("/maps/m").await.ok()["calibration"], Value::Null);
 }
 
@@ -131,10 +181,18 @@ async fn scores_of_another_re_ranking_are_not_judged() {
     app.post_png("/references?map=m", 1).await.created();
     put(&app, "/maps/m/calibration", &calibration()).await.ok();
     drop(app);
-    let app = App::open(directory, FakeSource::new("fake-1"), |config| config.rerank.tolerance_patches = 3.0);
-    assert_eq!(app.post_png("/query?map=m", 1).await.ok()["matched"], Value::Null);
+    let app = App::open(directory, FakeSource::new("fake-1"), |config| {
+        config.rerank.tolerance_patches = 3.0
+    });
+    assert_eq!(
+        app.post_png("/query?map=m", 1).await.ok()["matched"],
+        Value::Null
+    );
     // Distances do not depend on the re-ranking.
-    assert_eq!(app.post_png("/query?map=m&rerank=false", 1).await.ok()["matched"], true);
+    assert_eq!(
+        app.post_png("/query?map=m&rerank=false", 1).await.ok()["matched"],
+        true
+    );
 }
 
 #[tokio::test]

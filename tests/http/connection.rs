@@ -36,7 +36,14 @@ impl Server {
         let serving = tokio::spawn(serve(listener, state.clone(), async {
             let _ = stopped.await;
         }));
-        Self { address, source, state, stop: Some(stop), serving, _directory: directory }
+        Self {
+            address,
+            source,
+            state,
+            stop: Some(stop),
+            serving,
+            _directory: directory,
+        }
     }
 
     async fn connect(&self) -> TcpStream {
@@ -58,7 +65,9 @@ impl Server {
 async fn read_all(stream: &mut TcpStream) -> String {
     let mut text = Vec::new();
     // A reset after the answer is as good an end as any.
-    let _ = timeout(PATIENCE, stream.read_to_end(&mut text)).await.expect("the server kept the connection");
+    let _ = timeout(PATIENCE, stream.read_to_end(&mut text))
+        .await
+        .expect("the server kept the connection");
     String::from_utf8_lossy(&text).into_owned()
 }
 
@@ -77,7 +86,10 @@ async fn a_body_that_dawdles_is_cut_off() {
     let mut stream = server.connect().await;
     stream.write_all(&whole[..whole.len() - 10]).await.unwrap();
     let answer = read_all(&mut stream).await;
-    assert!(answer.starts_with("HTTP/1.1 408") && answer.contains("request_timeout"), "{answer}");
+    assert!(
+        answer.starts_with("HTTP/1.1 408") && answer.contains("request_timeout"),
+        "{answer}"
+    );
     assert_eq!(server.source.described(), 0);
 }
 
@@ -95,7 +107,9 @@ async fn a_body_that_drips_is_cut_off_as_a_whole() {
         }
     });
     let mut text = Vec::new();
-    let _ = timeout(PATIENCE, reader.read_to_end(&mut text)).await.expect("the server kept the connection");
+    let _ = timeout(PATIENCE, reader.read_to_end(&mut text))
+        .await
+        .expect("the server kept the connection");
     assert!(String::from_utf8_lossy(&text).starts_with("HTTP/1.1 408"));
     dripping.abort();
 }
@@ -104,7 +118,10 @@ async fn a_body_that_drips_is_cut_off_as_a_whole() {
 async fn a_head_that_dawdles_is_cut_off() {
     let server = Server::start(|config| config.http.header_timeout_ms = 200).await;
     let mut stream = server.connect().await;
-    stream.write_all(b"GET /livez HTTP/1.1\r\nhost: x\r\nx-slow").await.unwrap();
+    stream
+        .write_all(b"GET /livez HTTP/1.1\r\nhost: x\r\nx-slow")
+        .await
+        .unwrap();
     let answer = read_all(&mut stream).await;
     assert!(!answer.contains("200 OK"), "{answer}");
 }
@@ -114,7 +131,10 @@ async fn a_body_over_the_limit_is_refused_before_it_is_sent() {
     let server = Server::start(|config| config.image.max_bytes = 1000).await;
     let head = "POST /query?map=m HTTP/1.1\r\nhost: x\r\ncontent-type: image/png\r\ncontent-length: 999999999\r\n\r\n";
     let answer = server.exchange(head.as_bytes()).await;
-    assert!(answer.starts_with("HTTP/1.1 413") && answer.contains("body_too_large"), "{answer}");
+    assert!(
+        answer.starts_with("HTTP/1.1 413") && answer.contains("body_too_large"),
+        "{answer}"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -122,16 +142,26 @@ async fn a_body_of_unknown_length_is_cut_off_at_the_limit() {
     let server = Server::start(|config| config.image.max_bytes = 1000).await;
     for path in ["/query?map=m", "/references?map=m"] {
         let mut stream = server.connect().await;
-        let head =
-            format!("POST {path} HTTP/1.1\r\nhost: x\r\ncontent-type: image/png\r\ntransfer-encoding: chunked\r\n\r\n");
+        let head = format!(
+            "POST {path} HTTP/1.1\r\nhost: x\r\ncontent-type: image/png\r\ntransfer-encoding: chunked\r\n\r\n"
+        );
         stream.write_all(head.as_bytes()).await.unwrap();
         // The last chunk never comes: the answer must not wait for it.
         for _ in 0..3 {
-            stream.write_all(format!("190\r\n{}\r\n", "x".repeat(0x190)).as_bytes()).await.unwrap();
+            stream
+                .write_all(format!("190\r\n{}\r\n", "x".repeat(0x190)).as_bytes())
+                .await
+                .unwrap();
         }
         let answer = read_all(&mut stream).await;
-        assert!(answer.starts_with("HTTP/1.1 413") && answer.contains("body_too_large"), "{answer}");
-        assert!(answer.to_ascii_lowercase().contains("connection: close"), "{answer}");
+        assert!(
+            answer.starts_with("HTTP/1.1 413") && answer.contains("body_too_large"),
+            "{answer}"
+        );
+        assert!(
+            answer.to_ascii_lowercase().contains("connection: close"),
+            "{answer}"
+        );
     }
     assert_eq!(server.source.described(), 0);
 }
@@ -139,38 +169,65 @@ async fn a_body_of_unknown_length_is_cut_off_at_the_limit() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_client_that_hangs_up_takes_its_work_along() {
     let server = Server::start(|_| {}).await;
-    assert!(server.exchange(&post("/references?map=m", &picture(0))).await.starts_with("HTTP/1.1 201"));
+    assert!(
+        server
+            .exchange(&post("/references?map=m", &picture(0)))
+            .await
+            .starts_with("HTTP/1.1 201")
+    );
     server.source.slow_down(Duration::from_millis(400));
     let staying = {
         let mut stream = server.connect().await;
-        stream.write_all(&post("/query?map=m", &picture(1))).await.unwrap();
+        stream
+            .write_all(&post("/query?map=m", &picture(1)))
+            .await
+            .unwrap();
         stream
     };
     sleep(Duration::from_millis(150)).await;
     for seed in 2..5 {
         let mut leaving = server.connect().await;
-        leaving.write_all(&post("/query?map=m", &picture(seed))).await.unwrap();
+        leaving
+            .write_all(&post("/query?map=m", &picture(seed)))
+            .await
+            .unwrap();
         sleep(Duration::from_millis(30)).await;
         drop(leaving);
     }
     let mut staying = staying;
     assert!(read_all(&mut staying).await.starts_with("HTTP/1.1 200"));
     server.source.slow_down(Duration::ZERO);
-    assert!(server.exchange(&post("/query?map=m", &picture(9))).await.starts_with("HTTP/1.1 200"));
+    assert!(
+        server
+            .exchange(&post("/query?map=m", &picture(9)))
+            .await
+            .starts_with("HTTP/1.1 200")
+    );
     assert_eq!(server.source.described(), 3);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn stopping_lets_requests_under_way_finish() {
     let mut server = Server::start(|_| {}).await;
-    assert!(server.exchange(&post("/references?map=m", &picture(0))).await.starts_with("HTTP/1.1 201"));
+    assert!(
+        server
+            .exchange(&post("/references?map=m", &picture(0)))
+            .await
+            .starts_with("HTTP/1.1 201")
+    );
     server.source.slow_down(Duration::from_millis(500));
     let mut stream = server.connect().await;
-    stream.write_all(&post("/query?map=m", &picture(1))).await.unwrap();
+    stream
+        .write_all(&post("/query?map=m", &picture(1)))
+        .await
+        .unwrap();
     sleep(Duration::from_millis(150)).await;
     server.stop();
     assert!(read_all(&mut stream).await.starts_with("HTTP/1.1 200"));
-    timeout(PATIENCE, &mut server.serving).await.unwrap().unwrap();
+    timeout(PATIENCE, &mut server.serving)
+        .await
+        .unwrap()
+        .unwrap();
     assert!(TcpStream::connect(server.address).await.is_err());
 }
 
@@ -182,23 +239,48 @@ async fn a_drain_delay_fails_readiness_first() {
     server.stop();
     sleep(Duration::from_millis(200)).await;
     let answer = server.exchange(get).await;
-    assert!(answer.starts_with("HTTP/1.1 503") && answer.contains("draining"), "{answer}");
-    assert!(server.exchange(&post("/references?map=m", &picture(0))).await.starts_with("HTTP/1.1 201"));
-    timeout(PATIENCE, &mut server.serving).await.unwrap().unwrap();
+    assert!(
+        answer.starts_with("HTTP/1.1 503") && answer.contains("draining"),
+        "{answer}"
+    );
+    assert!(
+        server
+            .exchange(&post("/references?map=m", &picture(0)))
+            .await
+            .starts_with("HTTP/1.1 201")
+    );
+    timeout(PATIENCE, &mut server.serving)
+        .await
+        .unwrap()
+        .unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_drain_deadline_answers_what_is_left() {
     let mut server = Server::start(|config| config.http.drain_timeout_ms = 200).await;
-    assert!(server.exchange(&post("/references?map=m", &picture(0))).await.starts_with("HTTP/1.1 201"));
+    assert!(
+        server
+            .exchange(&post("/references?map=m", &picture(0)))
+            .await
+            .starts_with("HTTP/1.1 201")
+    );
     server.source.slow_down(Duration::from_secs(3));
     let mut stream = server.connect().await;
-    stream.write_all(&post("/query?map=m", &picture(1))).await.unwrap();
+    stream
+        .write_all(&post("/query?map=m", &picture(1)))
+        .await
+        .unwrap();
     sleep(Duration::from_millis(150)).await;
     server.stop();
     let answer = read_all(&mut stream).await;
-    assert!(answer.starts_with("HTTP/1.1 503") && answer.contains("shutting_down"), "{answer}");
-    timeout(PATIENCE, &mut server.serving).await.unwrap().unwrap();
+    assert!(
+        answer.starts_with("HTTP/1.1 503") && answer.contains("shutting_down"),
+        "{answer}"
+    );
+    timeout(PATIENCE, &mut server.serving)
+        .await
+        .unwrap()
+        .unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -207,9 +289,16 @@ async fn connections_beyond_the_bound_wait_their_turn() {
     let holder = server.connect().await;
     sleep(Duration::from_millis(100)).await;
     let mut waiting = server.connect().await;
-    waiting.write_all(b"GET /livez HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n").await.unwrap();
+    waiting
+        .write_all(b"GET /livez HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n")
+        .await
+        .unwrap();
     let mut byte = [0];
-    assert!(timeout(Duration::from_millis(300), waiting.read(&mut byte)).await.is_err());
+    assert!(
+        timeout(Duration::from_millis(300), waiting.read(&mut byte))
+            .await
+            .is_err()
+    );
     drop(holder);
     assert!(read_all(&mut waiting).await.contains("200 OK"));
     assert!(server.state.health.unready().is_none());

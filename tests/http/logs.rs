@@ -1,4 +1,5 @@
-//! The log as a collector sees it: one JSON object a line, and every line of a request under its id.
+//! The log as a collector sees it: one JSON object a line, and every line of a request under its
+//! id.
 
 use crate::disk::damage_patches;
 use crate::process::{Server, source};
@@ -9,13 +10,21 @@ use std::sync::Arc;
 
 fn lines(log: &Path) -> Vec<Value> {
     let text = std::fs::read_to_string(log).unwrap();
-    text.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("not JSON: {line}"))).collect()
+    text.lines()
+        .map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("not JSON: {line}")))
+        .collect()
 }
 
 const BROKEN: &str = "a blocking task failed";
 
 /// Request id, path, body, expected status, and lines that must be logged beside "answered".
-type Case = (&'static str, &'static str, Vec<u8>, u16, &'static [&'static str]);
+type Case = (
+    &'static str,
+    &'static str,
+    Vec<u8>,
+    u16,
+    &'static [&'static str],
+);
 
 #[test]
 fn every_line_of_a_request_carries_its_id_whatever_thread_it_comes_from() {
@@ -34,8 +43,20 @@ fn every_line_of_a_request_carries_its_id_whatever_thread_it_comes_from() {
     assert!(seen > 0, "the start is logged");
     let cases: [Case; 4] = [
         ("adds", "/references?map=m", picture(9), 201, &[]),
-        ("meets-damage", "/query?map=m", picture(1), 200, &["a stored reference is damaged; it is quarantined"]),
-        ("breaks-decoder", "/query?map=m", BREAKS_THE_DECODER.to_vec(), 422, &["a thread panicked", BROKEN]),
+        (
+            "meets-damage",
+            "/query?map=m",
+            picture(1),
+            200,
+            &["a stored reference is damaged; it is quarantined"],
+        ),
+        (
+            "breaks-decoder",
+            "/query?map=m",
+            BREAKS_THE_DECODER.to_vec(),
+            422,
+            &["a thread panicked", BROKEN],
+        ),
         (
             "breaks-model",
             "/query?map=m",
@@ -50,10 +71,16 @@ fn every_line_of_a_request_carries_its_id_whatever_thread_it_comes_from() {
         let all = lines(&log);
         let new = &all[seen..];
         for line in new {
-            assert_eq!(line["span"]["request_id"], id, "a line of {id} without its id: {line}");
+            assert_eq!(
+                line["span"]["request_id"], id,
+                "a line of {id} without its id: {line}"
+            );
         }
         for text in expected.iter().chain(&["answered"]) {
-            assert!(new.iter().any(|line| line["message"] == *text), "{id}: no line says {text:?}: {new:?}");
+            assert!(
+                new.iter().any(|line| line["message"] == *text),
+                "{id}: no line says {text:?}: {new:?}"
+            );
         }
         seen = all.len();
     }

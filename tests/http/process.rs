@@ -1,4 +1,5 @@
-//! The real server in a process of its own: this test binary, started again on one test that serves.
+//! The real server in a process of its own: this test binary, started again on one test that
+//! serves.
 
 use crate::support::{BACKBONE, FakeSource, head};
 use placeformer::cli::serve::{Loaders, run_server};
@@ -27,17 +28,29 @@ pub fn source() -> Arc<FakeSource> {
 
 /// Settings of the store behind the server.
 pub fn store_config() -> StoreConfig {
-    StoreConfig { reserve_bytes: 1 << 20, ..StoreConfig::default() }
+    StoreConfig {
+        reserve_bytes: 1 << 20,
+        ..StoreConfig::default()
+    }
 }
 
 /// Not a test of its own: the server that others start.
 #[test]
 fn child_that_serves_until_it_is_killed() {
-    let Some(directory) = std::env::var_os(DIRECTORY) else { return };
+    let Some(directory) = std::env::var_os(DIRECTORY) else {
+        return;
+    };
     if std::env::var_os(LOGGED).is_some() {
-        logging::init(&LogConfig { format: LogFormat::Json, ..LogConfig::default() }).unwrap();
+        logging::init(&LogConfig {
+            format: LogFormat::Json,
+            ..LogConfig::default()
+        })
+        .unwrap();
     }
-    let mut config = Config { store: store_config(), ..Config::default() };
+    let mut config = Config {
+        store: store_config(),
+        ..Config::default()
+    };
     config.data.directory = directory.into();
     config.pipeline.disk_reserve_bytes = 0;
     let (data, store) = (config.data.directory.clone(), config.store.clone());
@@ -50,14 +63,17 @@ fn child_that_serves_until_it_is_killed() {
         // Past the test harness, which captures what `println!` prints.
         let line = format!("\nlistening on http://{}\n", listener.local_addr().unwrap());
         std::io::stdout().write_all(line.as_bytes()).unwrap();
-        run_server(listener, config, loaders, std::future::pending()).await.unwrap();
+        run_server(listener, config, loaders, std::future::pending())
+            .await
+            .unwrap();
     });
 }
 
 /// The server in a process of its own.
 pub struct Server {
     child: Mutex<Child>,
-    /// Kept open: the harness in the child prints a line after a minute, and ends the process if nobody listens.
+    /// Kept open: the harness in the child prints a line after a minute, and ends the process if
+    /// nobody listens.
     _output: BufReader<ChildStdout>,
     url: String,
     http: reqwest::blocking::Client,
@@ -67,13 +83,20 @@ impl Server {
     /// Starts it on what is in `directory` and waits until it is ready.
     #[track_caller]
     pub fn start(directory: &Path, crash_point: Option<String>) -> Self {
-        let Some(point) = crash_point else { return Self::start_with(directory, |_| {}).unwrap() };
-        // Starting goes on with what an earlier death interrupted, so the point may be reached before it is ready.
+        let Some(point) = crash_point else {
+            return Self::start_with(directory, |_| {}).unwrap();
+        };
+        // Starting goes on with what an earlier death interrupted, so the point may be reached
+        // before it is ready.
         Self::start_with(directory, |command| {
             command.env(crash_points::VARIABLE, point);
         })
         .unwrap_or_else(|died| {
-            assert_eq!(died.signal(), Some(SIGABRT), "the server died of something else while it started: {died}");
+            assert_eq!(
+                died.signal(),
+                Some(SIGABRT),
+                "the server died of something else while it started: {died}"
+            );
             Self::start_with(directory, |_| {}).unwrap()
         })
     }
@@ -93,26 +116,45 @@ impl Server {
     fn start_with(directory: &Path, change: impl FnOnce(&mut Command)) -> Result<Self, ExitStatus> {
         let mut command = Command::new(std::env::current_exe().unwrap());
         command
-            .args(["--exact", "process::child_that_serves_until_it_is_killed", "--nocapture"])
+            .args([
+                "--exact",
+                "process::child_that_serves_until_it_is_killed",
+                "--nocapture",
+            ])
             .env(DIRECTORY, directory)
             .stdout(Stdio::piped())
             .stderr(Stdio::null());
         change(&mut command);
         let mut child = command.spawn().unwrap();
         let mut output = BufReader::new(child.stdout.take().unwrap());
-        let url =
-            output.by_ref().lines().find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
+        let url = output
+            .by_ref()
+            .lines()
+            .find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
         // Fails only if one is installed already, which is as good.
         let _ = rustls::crypto::ring::default_provider().install_default();
-        let http = reqwest::blocking::Client::builder().timeout(Duration::from_secs(30)).build().unwrap();
-        let server =
-            Self { child: Mutex::new(child), _output: output, url: url.expect("the server did not start"), http };
+        let http = reqwest::blocking::Client::builder()
+            .timeout(Duration::from_secs(30))
+            .build()
+            .unwrap();
+        let server = Self {
+            child: Mutex::new(child),
+            _output: output,
+            url: url.expect("the server did not start"),
+            http,
+        };
         let began = Instant::now();
-        while server.get("/readyz").is_none_or(|(status, _)| status != 200) {
+        while server
+            .get("/readyz")
+            .is_none_or(|(status, _)| status != 200)
+        {
             if let Some(died) = server.child.lock().unwrap().try_wait().unwrap() {
                 return Err(died);
             }
-            assert!(began.elapsed() < Duration::from_secs(60), "the server never became ready");
+            assert!(
+                began.elapsed() < Duration::from_secs(60),
+                "the server never became ready"
+            );
             std::thread::sleep(Duration::from_millis(2));
         }
         Ok(server)
@@ -125,25 +167,50 @@ impl Server {
 
     /// An answer that is not JSON.
     pub fn text(&self, path: &str) -> String {
-        self.http.get(format!("{}{path}", self.url)).send().unwrap().text().unwrap()
+        self.http
+            .get(format!("{}{path}", self.url))
+            .send()
+            .unwrap()
+            .text()
+            .unwrap()
     }
 
     /// As [`Server::get`], with a picture.
     pub fn post(&self, path: &str, body: Vec<u8>) -> Option<(u16, Value)> {
         let url = format!("{}{path}", self.url);
-        read(self.http.post(url).header("content-type", "image/png").body(body).send())
+        read(
+            self.http
+                .post(url)
+                .header("content-type", "image/png")
+                .body(body)
+                .send(),
+        )
     }
 
     /// As [`Server::get`], with a file.
     pub fn put(&self, path: &str, body: Vec<u8>) -> Option<(u16, Value)> {
         let url = format!("{}{path}", self.url);
-        read(self.http.put(url).header("content-type", "application/octet-stream").body(body).send())
+        read(
+            self.http
+                .put(url)
+                .header("content-type", "application/octet-stream")
+                .body(body)
+                .send(),
+        )
     }
 
     /// As [`Server::post`], under the request id `id`.
     pub fn post_as(&self, id: &str, path: &str, body: Vec<u8>) -> Option<(u16, Value)> {
-        let request = self.http.post(format!("{}{path}", self.url)).header("x-request-id", id);
-        read(request.header("content-type", "image/png").body(body).send())
+        let request = self
+            .http
+            .post(format!("{}{path}", self.url))
+            .header("x-request-id", id);
+        read(
+            request
+                .header("content-type", "image/png")
+                .body(body)
+                .send(),
+        )
     }
 
     /// As [`Server::get`].

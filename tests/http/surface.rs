@@ -12,19 +12,41 @@ async fn a_reference_is_created_shown_changed_and_deleted() {
     let app = App::new();
     let created = app.post_png("/references?map=m&external_id=a&lat=51.5&lon=-0.1&heading=-90&captured_at=2026-05-17T09:30:00Z&metadata=%7B%22camera%22:%22left%22%7D", 1).await;
     let body = created.created();
-    assert_eq!(body["location"], json!({"lat": 51.5, "lon": -0.1, "heading": 270.0}));
-    assert_eq!((&body["map"], &body["external_id"]), (&json!("m"), &json!("a")));
-    assert_eq!((&body["captured_at"], &body["metadata"]), (&json!("2026-05-17T09:30:00Z"), &json!({"camera": "left"})));
+    assert_eq!(
+        body["location"],
+        json!({"lat": 51.5, "lon": -0.1, "heading": 270.0})
+    );
+    assert_eq!(
+        (&body["map"], &body["external_id"]),
+        (&json!("m"), &json!("a"))
+    );
+    assert_eq!(
+        (&body["captured_at"], &body["metadata"]),
+        (&json!("2026-05-17T09:30:00Z"), &json!({"camera": "left"}))
+    );
     let path = format!("/references/{}", body["id"].as_str().unwrap());
     assert_eq!(created.header("location"), path);
     assert!(created.header("server-timing").contains("extract;dur="));
     assert_eq!(app.get(&path).await.ok(), body);
 
-    let changed = app.patch(&path, &json!({"lat": null, "lon": null, "external_id": "b"})).await;
-    assert_eq!(changed.ok()["location"], json!({"lat": null, "lon": null, "heading": 270.0}));
+    let changed = app
+        .patch(
+            &path,
+            &json!({"lat": null, "lon": null, "external_id": "b"}),
+        )
+        .await;
+    assert_eq!(
+        changed.ok()["location"],
+        json!({"lat": null, "lon": null, "heading": 270.0})
+    );
     assert_eq!(changed.json["external_id"], "b");
     assert_eq!(changed.json["metadata"], json!({"camera": "left"}));
-    assert_eq!(app.patch(&path, &json!({"metadata": null, "heading": null})).await.ok()["metadata"], Value::Null);
+    assert_eq!(
+        app.patch(&path, &json!({"metadata": null, "heading": null}))
+            .await
+            .ok()["metadata"],
+        Value::Null
+    );
     assert_eq!(app.get(&path).await.ok()["location"], Value::Null);
 
     assert_eq!(app.delete(&path).await.status, 204);
@@ -36,17 +58,31 @@ async fn a_reference_is_created_shown_changed_and_deleted() {
 async fn an_image_may_come_raw_as_multipart_or_as_base64() {
     let app = App::new();
     app.post_png("/references?map=m", 1).await.created();
-    let (kind, body) = multipart(&[("image", &picture(2)), ("json", br#"{"map": "m", "lat": 1, "lon": 2}"#)]);
-    assert_eq!(app.post("/references", &kind, body).await.created()["location"]["lon"], 2.0);
+    let (kind, body) = multipart(&[
+        ("image", &picture(2)),
+        ("json", br#"{"map": "m", "lat": 1, "lon": 2}"#),
+    ]);
+    assert_eq!(
+        app.post("/references", &kind, body).await.created()["location"]["lon"],
+        2.0
+    );
     let (kind, body) = multipart(&[("image", &picture(3))]);
     app.post("/references?map=m", &kind, body).await.created();
     let json = json!({"image": STANDARD.encode(picture(4)), "map": "m", "metadata": {"n": [1, 2]}});
-    let created = app.post("/references", "application/json", json.to_string()).await;
+    let created = app
+        .post("/references", "application/json", json.to_string())
+        .await;
     assert_eq!(created.created()["metadata"], json!({"n": [1, 2]}));
     assert_eq!(app.get("/maps/m").await.ok()["references"], 4);
 
     let json = json!({"image": STANDARD.encode(picture(4)), "map": "m", "top_k": 1});
-    let found = app.post("/query", "application/json; charset=utf-8", json.to_string()).await;
+    let found = app
+        .post(
+            "/query",
+            "application/json; charset=utf-8",
+            json.to_string(),
+        )
+        .await;
     assert_eq!(found.ok()["results"][0]["reference_id"], created.json["id"]);
 }
 
@@ -54,7 +90,12 @@ async fn an_image_may_come_raw_as_multipart_or_as_base64() {
 async fn a_query_is_answered_with_ranked_evidence() {
     let app = App::new();
     for seed in 0..8 {
-        app.post_png(&format!("/references?map=m&external_id={seed}&lat=50.{seed}&lon=8"), seed).await.created();
+        app.post_png(
+            &format!("/references?map=m&external_id={seed}&lat=50.{seed}&lon=8"),
+            seed,
+        )
+        .await
+        .created();
     }
     let answer = app.post_png("/query?map=m&top_k=3", 5).await;
     let body = answer.ok();
@@ -62,16 +103,30 @@ async fn a_query_is_answered_with_ranked_evidence() {
     assert_eq!(body["model"], "fake-1");
     let results = body["results"].as_array().unwrap();
     assert_eq!(results.len(), 3);
-    assert_eq!((&results[0]["external_id"], &results[0]["rank"]), (&json!("5"), &json!(1)));
-    assert_eq!(results[0]["location"], json!({"lat": 50.5, "lon": 8.0, "heading": null}));
+    assert_eq!(
+        (&results[0]["external_id"], &results[0]["rank"]),
+        (&json!("5"), &json!(1))
+    );
+    assert_eq!(
+        results[0]["location"],
+        json!({"lat": 50.5, "lon": 8.0, "heading": null})
+    );
     let scores = results[0]["scores"].as_object().unwrap();
     assert_eq!(scores.keys().collect::<Vec<_>>(), ["s11", "s12", "s23"]);
-    let inliers: u64 = scores.values().map(|score| score["inliers"].as_u64().unwrap()).sum();
+    let inliers: u64 = scores
+        .values()
+        .map(|score| score["inliers"].as_u64().unwrap())
+        .sum();
     assert_eq!(results[0]["spatial_score"], inliers);
     assert!(inliers > results[1]["spatial_score"].as_u64().unwrap());
     for stage in ["decode", "queue", "extract", "search", "load", "rerank"] {
         assert!(body["timings_ms"][stage].is_number(), "{stage}");
-        assert!(answer.header("server-timing").contains(&format!("{stage};dur=")), "{stage}");
+        assert!(
+            answer
+                .header("server-timing")
+                .contains(&format!("{stage};dur=")),
+            "{stage}"
+        );
     }
 }
 
@@ -79,31 +134,49 @@ async fn a_query_is_answered_with_ranked_evidence() {
 async fn filters_and_options_shape_the_answer() {
     let app = App::new();
     for seed in 0..4 {
-        let fields = format!("external_id={seed}&lat=50&lon={seed}&captured_at=2026-01-0{}T00:00:00Z", seed + 1);
-        app.post_png(&format!("/references?map=m&{fields}"), seed).await.created();
+        let fields = format!(
+            "external_id={seed}&lat=50&lon={seed}&captured_at=2026-01-0{}T00:00:00Z",
+            seed + 1
+        );
+        app.post_png(&format!("/references?map=m&{fields}"), seed)
+            .await
+            .created();
     }
     let names = |answer: &Value| -> Vec<String> {
         let results = answer["results"].as_array().unwrap();
-        results.iter().map(|result| result["external_id"].as_str().unwrap().to_owned()).collect()
+        results
+            .iter()
+            .map(|result| result["external_id"].as_str().unwrap().to_owned())
+            .collect()
     };
-    let near = app.post_png("/query?map=m&near=50,3&radius_m=1000", 0).await;
+    let near = app
+        .post_png("/query?map=m&near=50,3&radius_m=1000", 0)
+        .await;
     assert_eq!(names(near.ok()), ["3"]);
     let mut timed = names(
-        app.post_png("/query?map=m&captured_after=2026-01-02T00:00:00Z&captured_before=2026-01-04T00:00:00Z", 0)
-            .await
-            .ok(),
+        app.post_png(
+            "/query?map=m&captured_after=2026-01-02T00:00:00Z&captured_before=2026-01-04T00:00:00Z",
+            0,
+        )
+        .await
+        .ok(),
     );
     timed.sort();
     assert_eq!(timed, ["1", "2"]);
     let global = app.post_png("/query?map=m&rerank=false&top_k=2", 2).await;
-    assert_eq!((&global.ok()["reranked"], names(&global.json)[0].as_str()), (&json!(false), "2"));
+    assert_eq!(
+        (&global.ok()["reranked"], names(&global.json)[0].as_str()),
+        (&json!(false), "2")
+    );
     assert_eq!(global.json["results"][0]["spatial_score"], Value::Null);
     assert_eq!(global.json["results"][0]["scores"], Value::Null);
     let few = app.post_png("/query?map=m&candidates=1&top_k=4", 1).await;
     assert_eq!(names(few.ok()).len(), 4);
     assert!(few.json["results"][0]["spatial_score"].is_number());
     assert_eq!(few.json["results"][1]["spatial_score"], Value::Null);
-    let nowhere = app.post_png("/query?map=m&near=-50,100&radius_m=10", 0).await;
+    let nowhere = app
+        .post_png("/query?map=m&near=-50,100&radius_m=10", 0)
+        .await;
     assert_eq!(names(nowhere.ok()), Vec::<String>::new());
 }
 
@@ -112,19 +185,54 @@ async fn a_moved_reference_is_found_at_its_new_place() {
     let app = App::new();
     let created = app.post_png("/references?map=m&lat=50&lon=8", 1).await;
     let path = format!("/references/{}", created.created()["id"].as_str().unwrap());
-    app.patch(&path, &json!({"lat": 10, "lon": 20, "captured_at": "2020-01-01T00:00:00Z"})).await.ok();
+    app.patch(
+        &path,
+        &json!({"lat": 10, "lon": 20, "captured_at": "2020-01-01T00:00:00Z"}),
+    )
+    .await
+    .ok();
     let found = |answer: Value| answer["results"].as_array().unwrap().len();
-    assert_eq!(found(app.post_png("/query?map=m&near=50,8&radius_m=100", 1).await.ok().clone()), 0);
-    assert_eq!(found(app.post_png("/query?map=m&near=10,20&radius_m=100", 1).await.ok().clone()), 1);
-    assert_eq!(found(app.post_png("/query?map=m&captured_before=2020-01-02T00:00:00Z", 1).await.ok().clone()), 1);
+    assert_eq!(
+        found(
+            app.post_png("/query?map=m&near=50,8&radius_m=100", 1)
+                .await
+                .ok()
+                .clone()
+        ),
+        0
+    );
+    assert_eq!(
+        found(
+            app.post_png("/query?map=m&near=10,20&radius_m=100", 1)
+                .await
+                .ok()
+                .clone()
+        ),
+        1
+    );
+    assert_eq!(
+        found(
+            app.post_png("/query?map=m&captured_before=2020-01-02T00:00:00Z", 1)
+                .await
+                .ok()
+                .clone()
+        ),
+        1
+    );
 }
 
 #[tokio::test]
 async fn a_deleted_reference_is_found_no_more() {
     let app = App::new();
-    let id = app.post_png("/references?map=m", 1).await.created()["id"].as_str().unwrap().to_owned();
+    let id = app.post_png("/references?map=m", 1).await.created()["id"]
+        .as_str()
+        .unwrap()
+        .to_owned();
     app.post_png("/references?map=m", 2).await.created();
-    assert_eq!(app.post_png("/query?map=m", 1).await.ok()["results"][0]["reference_id"], id.as_str());
+    assert_eq!(
+        app.post_png("/query?map=m", 1).await.ok()["results"][0]["reference_id"],
+        id.as_str()
+    );
     app.delete(&format!("/references/{id}")).await;
     let answer = app.post_png("/query?map=m", 1).await;
     let results = answer.ok()["results"].as_array().unwrap();
@@ -135,45 +243,74 @@ async fn a_deleted_reference_is_found_no_more() {
 async fn listings_come_in_pages() {
     let app = App::new();
     for seed in 0..5 {
-        app.post_png(&format!("/references?map=m&external_id={seed}"), seed).await.created();
+        app.post_png(&format!("/references?map=m&external_id={seed}"), seed)
+            .await
+            .created();
     }
     app.post_png("/references?map=other", 9).await.created();
     let (mut seen, mut path) = (Vec::new(), "/references?map=m&limit=2".to_owned());
     loop {
         let page = app.get(&path).await;
         let references = page.ok()["references"].as_array().unwrap();
-        seen.extend(references.iter().map(|one| one["external_id"].as_str().unwrap().to_owned()));
-        let Some(next) = page.json["next"].as_str() else { break };
+        seen.extend(
+            references
+                .iter()
+                .map(|one| one["external_id"].as_str().unwrap().to_owned()),
+        );
+        let Some(next) = page.json["next"].as_str() else {
+            break;
+        };
         path = format!("/references?map=m&limit=2&cursor={next}");
     }
     assert_eq!(seen, ["0", "1", "2", "3", "4"]);
     assert_eq!(app.count().await, 6);
     let one = app.get("/references?map=m&external_id=3").await;
     assert_eq!(one.ok()["references"].as_array().unwrap().len(), 1);
-    assert_eq!(app.get("/references?map=m&external_id=x").await.ok()["references"], json!([]));
+    assert_eq!(
+        app.get("/references?map=m&external_id=x").await.ok()["references"],
+        json!([])
+    );
 }
 
 #[tokio::test]
 async fn maps_are_listed_shown_and_deleted() {
     let app = App::new();
     for (map, seed) in [("b", 1), ("a", 2), ("b", 3)] {
-        app.post_png(&format!("/references?map={map}"), seed).await.created();
+        app.post_png(&format!("/references?map={map}"), seed)
+            .await
+            .created();
     }
     let list = app.get("/maps").await;
-    let names: Vec<_> = list.ok()["maps"].as_array().unwrap().iter().map(|map| map["name"].clone()).collect();
+    let names: Vec<_> = list.ok()["maps"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|map| map["name"].clone())
+        .collect();
     assert_eq!(names, [json!("a"), json!("b")]);
     assert_eq!(app.get("/maps/b").await.ok()["references"], 2);
     assert_eq!(app.delete("/maps/b").await.ok()["references_deleted"], 2);
     app.get("/maps/b").await.problem("map_not_found");
-    app.post_png("/query?map=b", 1).await.problem("map_not_found");
+    app.post_png("/query?map=b", 1)
+        .await
+        .problem("map_not_found");
     app.post_png("/references?map=b", 1).await.created();
-    assert_eq!(app.post_png("/query?map=b", 1).await.ok()["results"].as_array().unwrap().len(), 1);
+    assert_eq!(
+        app.post_png("/query?map=b", 1).await.ok()["results"]
+            .as_array()
+            .unwrap()
+            .len(),
+        1
+    );
 }
 
 #[tokio::test]
 async fn two_images_or_an_image_and_a_reference_are_matched() {
     let app = App::new();
-    let id = app.post_png("/references?map=m", 1).await.created()["id"].as_str().unwrap().to_owned();
+    let id = app.post_png("/references?map=m", 1).await.created()["id"]
+        .as_str()
+        .unwrap()
+        .to_owned();
     let (kind, body) = multipart(&[("query", &picture(1)), ("reference", &picture(1))]);
     let pair = app.post("/match", &kind, body).await;
     let stored = app.post_png(&format!("/match?reference_id={id}"), 1).await;
@@ -182,7 +319,10 @@ async fn two_images_or_an_image_and_a_reference_are_matched() {
     assert_eq!(s11["matches"], 48);
     assert_eq!(s11["homography"].as_array().unwrap().len(), 9);
     let first = &s11["correspondences"][0];
-    assert_eq!((&first["query"], &first["query_scale"]), (&first["reference"], &json!(1)));
+    assert_eq!(
+        (&first["query"], &first["query_scale"]),
+        (&first["reference"], &json!(1))
+    );
     assert_eq!(pair.json["input_size"], json!({"width": 112, "height": 84}));
     let json = json!({"query": STANDARD.encode(picture(1)), "reference_id": id}).to_string();
     app.post("/match", "application/json", json).await.ok();
@@ -201,7 +341,9 @@ async fn the_service_describes_itself() {
     let page = app.get("/docs/").await;
     assert!(page.status == 200 && page.text.contains("swagger"));
     assert!(app.get("/docs/swagger-ui-bundle.js").await.status == 200);
-    let head = app.send(Request::head("/info").body(Body::empty()).unwrap()).await;
+    let head = app
+        .send(Request::head("/info").body(Body::empty()).unwrap())
+        .await;
     assert_eq!((head.status.as_u16(), head.text.as_str()), (200, ""));
 }
 
@@ -210,7 +352,9 @@ async fn metrics_follow_what_happens() {
     let app = App::new();
     app.post_png("/references?map=m", 1).await.created();
     app.post_png("/query?map=m", 1).await.ok();
-    app.post_png("/query?map=none", 1).await.problem("map_not_found");
+    app.post_png("/query?map=none", 1)
+        .await
+        .problem("map_not_found");
     let text = app.get("/metrics").await.text;
     for line in [
         "placeformer_http_requests_total{method=\"POST\",route=\"/references\",status=\"201\"} 1",
@@ -223,33 +367,61 @@ async fn metrics_follow_what_happens() {
         "placeformer_query_top1_score_count 1",
         "placeformer_queue_depth 0",
     ] {
-        assert!(text.lines().any(|have| have == line), "{line} is not in\n{text}");
+        assert!(
+            text.lines().any(|have| have == line),
+            "{line} is not in\n{text}"
+        );
     }
 }
 
 #[tokio::test]
 async fn request_ids_are_taken_over_or_minted() {
     let app = App::new();
-    let with = |id: &str| Request::get("/livez").header("x-request-id", id).body(Body::empty()).unwrap();
-    assert_eq!(app.send(with("drive7-42")).await.header("x-request-id"), "drive7-42");
+    let with = |id: &str| {
+        Request::get("/livez")
+            .header("x-request-id", id)
+            .body(Body::empty())
+            .unwrap()
+    };
+    assert_eq!(
+        app.send(with("drive7-42")).await.header("x-request-id"),
+        "drive7-42"
+    );
     for bad in ["a b", "x\"y", &"x".repeat(129)] {
         let minted = app.send(with(bad)).await.header("x-request-id").to_owned();
         assert!(minted != bad && minted.len() == 36, "{minted}");
     }
-    let refused = app.send(Request::get("/nowhere").header("x-request-id", "q1").body(Body::empty()).unwrap()).await;
+    let refused = app
+        .send(
+            Request::get("/nowhere")
+                .header("x-request-id", "q1")
+                .body(Body::empty())
+                .unwrap(),
+        )
+        .await;
     refused.problem("route_not_found");
     assert_eq!(refused.json["request_id"], "q1");
 }
 
-/// As `placeformer openapi | head` does: the document is longer than a pipe holds, so its writer meets the closed end.
+/// As `placeformer openapi | head` does: the document is longer than a pipe holds, so its writer
+/// meets the closed end.
 #[test]
 fn a_command_ends_quietly_when_the_reader_of_its_output_has_gone() {
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    command.arg("openapi").stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped());
+    command
+        .arg("openapi")
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped());
     let mut child = command.spawn().unwrap();
     drop(child.stdout.take());
     let output = child.wait_with_output().unwrap();
-    assert_eq!((output.status.code(), String::from_utf8_lossy(&output.stderr).as_ref()), (Some(141), ""));
+    assert_eq!(
+        (
+            output.status.code(),
+            String::from_utf8_lossy(&output.stderr).as_ref()
+        ),
+        (Some(141), "")
+    );
 }
 
 #[test]
@@ -257,7 +429,10 @@ fn the_committed_openapi_document_is_current() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/openapi/openapi.json");
     let committed = std::fs::read_to_string(path).unwrap();
     let current = placeformer::http::openapi::document_text();
-    assert!(committed == current, "renew it with: placeformer openapi --out openapi/openapi.json");
+    assert!(
+        committed == current,
+        "renew it with: placeformer openapi --out openapi/openapi.json"
+    );
 }
 
 #[test]
@@ -267,23 +442,47 @@ fn every_operation_is_described_with_its_errors() {
     for (path, item) in document["paths"].as_object().unwrap() {
         for (method, operation) in item.as_object().unwrap() {
             let name = format!("{method} {path}");
-            assert!(operation["summary"].as_str().is_some_and(|summary| !summary.is_empty()), "{name}");
+            assert!(
+                operation["summary"]
+                    .as_str()
+                    .is_some_and(|summary| !summary.is_empty()),
+                "{name}"
+            );
             let id = operation["operationId"].as_str().unwrap_or_default();
-            assert!(!id.is_empty() && ids.insert(id.to_owned()), "{name}: operationId {id:?} is missing or used twice");
-            for (status, response) in
-                operation["responses"].as_object().unwrap().iter().filter(|(s, _)| s.as_str() < "300")
+            assert!(
+                !id.is_empty() && ids.insert(id.to_owned()),
+                "{name}: operationId {id:?} is missing or used twice"
+            );
+            for (status, response) in operation["responses"]
+                .as_object()
+                .unwrap()
+                .iter()
+                .filter(|(s, _)| s.as_str() < "300")
             {
                 let content = response["content"].as_object().into_iter().flatten();
-                content.for_each(|(_, content)| assert!(!content["example"].is_null(), "{name} {status}: no example"));
+                content.for_each(|(_, content)| {
+                    assert!(!content["example"].is_null(), "{name} {status}: no example")
+                });
             }
             if let Some(content) = operation.pointer("/requestBody/content/application~1json") {
-                assert!(content["example"].is_object(), "{name}: no example of a body");
+                assert!(
+                    content["example"].is_object(),
+                    "{name}: no example of a body"
+                );
             }
-            let failures =
-                operation["responses"].as_object().unwrap().iter().filter(|(status, _)| status.as_str() >= "400");
+            let failures = operation["responses"]
+                .as_object()
+                .unwrap()
+                .iter()
+                .filter(|(status, _)| status.as_str() >= "400");
             for (status, response) in failures.filter(|_| path != "/readyz") {
                 let examples = &response["content"]["application/problem+json"]["examples"];
-                assert!(examples.as_object().is_some_and(|examples| !examples.is_empty()), "{name} {status}");
+                assert!(
+                    examples
+                        .as_object()
+                        .is_some_and(|examples| !examples.is_empty()),
+                    "{name} {status}"
+                );
             }
         }
     }

@@ -1,5 +1,5 @@
-//! A whole service without weights: a real store in a temporary directory, the real surface, and a descriptor source
-//! that derives everything from the image's content.
+//! A whole service without weights: a real store in a temporary directory, the real surface, and a
+//! descriptor source that derives everything from the image's content.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
 use axum::body::Body;
@@ -14,8 +14,8 @@ use placeformer::ops::{Health, Metrics};
 use placeformer::pipeline::{DescriptorSource, Parts, Service};
 use placeformer::store::{PlaceStore, SqliteStore, StoreConfig};
 use placeformer::types::{
-    Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid, PoolingStride,
-    ScaleKeyPatches,
+    Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid,
+    PoolingStride, ScaleKeyPatches,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -28,14 +28,18 @@ use tempfile::TempDir;
 use tower::ServiceExt;
 
 /// Size the fake model asks for.
-pub const SIZE: ImageSize = ImageSize { width: 112, height: 84 };
+pub const SIZE: ImageSize = ImageSize {
+    width: 112,
+    height: 84,
+};
 
 /// Bytes over which the fake source panics while it decodes.
 pub const BREAKS_THE_DECODER: &[u8] = b"this breaks the decoder";
 /// Bytes over which the fake source panics while it describes.
 pub const BREAKS_THE_MODEL: &[u8] = b"this breaks the model";
 
-/// Descriptors from content alone: equal images are equal, different ones as unrelated as random vectors.
+/// Descriptors from content alone: equal images are equal, different ones as unrelated as random
+/// vectors.
 pub struct FakeSource {
     model: ModelId,
     head: Option<Head>,
@@ -77,7 +81,10 @@ struct Inside<'a>(&'a Step);
 
 impl<'a> Inside<'a> {
     fn enter(step: &'a Step) -> Self {
-        step.peak.fetch_max(step.inside.fetch_add(1, Ordering::SeqCst) + 1, Ordering::SeqCst);
+        step.peak.fetch_max(
+            step.inside.fetch_add(1, Ordering::SeqCst) + 1,
+            Ordering::SeqCst,
+        );
         Self(step)
     }
 }
@@ -105,10 +112,15 @@ impl Gate {
         self.moved.notify_all();
     }
 
-    /// Waits until it is open. A test that failed meanwhile opens nothing, and must end all the same.
+    /// Waits until it is open. A test that failed meanwhile opens nothing, and must end all the
+    /// same.
     pub fn pass(&self) {
         let closed = self.closed.lock().unwrap();
-        drop(self.moved.wait_timeout_while(closed, 2 * PATIENCE, |closed| *closed).unwrap());
+        drop(
+            self.moved
+                .wait_timeout_while(closed, 2 * PATIENCE, |closed| *closed)
+                .unwrap(),
+        );
     }
 }
 
@@ -174,7 +186,10 @@ impl DescriptorSource for FakeSource {
     fn decode(&self, bytes: &[u8], config: &ImageConfig) -> Result<ImageTensor, ImageError> {
         self.decoding.run(|| match bytes {
             BREAKS_THE_DECODER => panic!("planted in the decoder"),
-            BREAKS_THE_MODEL => Ok(ImageTensor { size: SIZE, data: vec![f32::NAN; 3 * 112 * 84] }),
+            BREAKS_THE_MODEL => Ok(ImageTensor {
+                size: SIZE,
+                data: vec![f32::NAN; 3 * 112 * 84],
+            }),
             _ => load_tensor(bytes, config, SIZE),
         })
     }
@@ -182,12 +197,17 @@ impl DescriptorSource for FakeSource {
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
         self.describing.run(|| {
             self.described.fetch_add(images.len(), Ordering::SeqCst);
-            assert!(images.iter().all(|image| !image.data[0].is_nan()), "planted in the model");
+            assert!(
+                images.iter().all(|image| !image.data[0].is_nan()),
+                "planted in the model"
+            );
             let delay = *self.delay.lock().unwrap();
             std::thread::sleep(delay);
             let mut descriptors: Vec<Descriptor> = images.iter().map(describe).collect();
             if let Some(head) = &self.head {
-                descriptors.iter_mut().for_each(|descriptor| descriptor.global = head.project(&descriptor.pooled));
+                descriptors
+                    .iter_mut()
+                    .for_each(|descriptor| descriptor.global = head.project(&descriptor.pooled));
             }
             Ok(descriptors)
         })
@@ -204,8 +224,17 @@ pub const BACKBONE: &str = "fake:0123456789ab:b8";
 /// A head for `backbone`, drawn from `seed`.
 pub fn head(seed: u64, backbone: &str, aggregate: Aggregate) -> Head {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let weight = (0..GLOBAL_DIM * 384).map(|_| rng.random_range(-1.0..1.0)).collect();
-    Head::new(aggregate, weight, vec![0.0; GLOBAL_DIM], backbone, [].into()).unwrap()
+    let weight = (0..GLOBAL_DIM * 384)
+        .map(|_| rng.random_range(-1.0..1.0))
+        .collect();
+    Head::new(
+        aggregate,
+        weight,
+        vec![0.0; GLOBAL_DIM],
+        backbone,
+        [].into(),
+    )
+    .unwrap()
 }
 
 /// The bytes of its file.
@@ -216,7 +245,11 @@ pub fn file_of(head: &Head) -> Vec<u8> {
 }
 
 fn describe(image: &ImageTensor) -> Descriptor {
-    let bytes: Vec<u8> = image.data.iter().flat_map(|value| value.to_le_bytes()).collect();
+    let bytes: Vec<u8> = image
+        .data
+        .iter()
+        .flat_map(|value| value.to_le_bytes())
+        .collect();
     let mut rng = ChaCha8Rng::seed_from_u64(u64::from(crc32fast::hash(&bytes)));
     let mut unit = |dim: usize| {
         let raw: Vec<f32> = (0..dim).map(|_| rng.random_range(-1.0..1.0)).collect();
@@ -225,14 +258,27 @@ fn describe(image: &ImageTensor) -> Descriptor {
     };
     let global = unit(GLOBAL_DIM);
     let pooled = unit(384);
-    let grid = PatchGrid { columns: 8, rows: 6, patch_px: 14, stride: PoolingStride::Kernel };
+    let grid = PatchGrid {
+        columns: 8,
+        rows: 6,
+        patch_px: 14,
+        stride: PoolingStride::Kernel,
+    };
     let mut scale = |count: u32| ScaleKeyPatches {
         index: (0..count).collect(),
         attention: (0..count).map(|i| 2.0 - i as f32 / 100.0).collect(),
         descriptors: (0..count).flat_map(|_| unit(384)).collect(),
     };
-    let patches = KeyPatches { grid, dim: 384, scales: [scale(48), scale(12), scale(4)] };
-    Descriptor { global, pooled, patches: PackedPatches::quantise(&patches) }
+    let patches = KeyPatches {
+        grid,
+        dim: 384,
+        scales: [scale(48), scale(12), scale(4)],
+    };
+    Descriptor {
+        global,
+        pooled,
+        patches: PackedPatches::quantise(&patches),
+    }
 }
 
 /// A running application.
@@ -249,10 +295,18 @@ impl App {
     }
 
     pub fn with(change: impl FnOnce(&mut Config)) -> Self {
-        Self::open(Arc::new(tempfile::tempdir().unwrap()), FakeSource::new("fake-1"), change)
+        Self::open(
+            Arc::new(tempfile::tempdir().unwrap()),
+            FakeSource::new("fake-1"),
+            change,
+        )
     }
 
-    pub fn open(directory: Arc<TempDir>, source: Arc<FakeSource>, change: impl FnOnce(&mut Config)) -> Self {
+    pub fn open(
+        directory: Arc<TempDir>,
+        source: Arc<FakeSource>,
+        change: impl FnOnce(&mut Config),
+    ) -> Self {
         Self::around(|store| Arc::new(store), directory, source, change)
     }
 
@@ -263,14 +317,25 @@ impl App {
         source: Arc<FakeSource>,
         change: impl FnOnce(&mut Config),
     ) -> Self {
-        let store = StoreConfig { reserve_bytes: 1 << 20, ..Default::default() };
-        let mut config = Config { store, ..Default::default() };
+        let store = StoreConfig {
+            reserve_bytes: 1 << 20,
+            ..Default::default()
+        };
+        let mut config = Config {
+            store,
+            ..Default::default()
+        };
         config.pipeline.disk_reserve_bytes = 0;
         change(&mut config);
         let store = wrap(SqliteStore::open(directory.path(), &config.store).unwrap());
         let (state, service) = start(store, source.clone(), config);
         state.open(service);
-        Self { router: app(state.clone()), state, source, directory }
+        Self {
+            router: app(state.clone()),
+            state,
+            source,
+            directory,
+        }
     }
 
     pub async fn send(&self, request: Request<Body>) -> Answer {
@@ -278,15 +343,23 @@ impl App {
     }
 
     pub async fn get(&self, path: &str) -> Answer {
-        self.send(Request::get(path).body(Body::empty()).unwrap()).await
+        self.send(Request::get(path).body(Body::empty()).unwrap())
+            .await
     }
 
     pub async fn delete(&self, path: &str) -> Answer {
-        self.send(Request::delete(path).body(Body::empty()).unwrap()).await
+        self.send(Request::delete(path).body(Body::empty()).unwrap())
+            .await
     }
 
     pub async fn post(&self, path: &str, kind: &str, body: impl Into<Body>) -> Answer {
-        self.send(Request::post(path).header("content-type", kind).body(body.into()).unwrap()).await
+        self.send(
+            Request::post(path)
+                .header("content-type", kind)
+                .body(body.into())
+                .unwrap(),
+        )
+        .await
     }
 
     pub async fn post_png(&self, path: &str, seed: u64) -> Answer {
@@ -294,7 +367,13 @@ impl App {
     }
 
     pub async fn put(&self, path: &str, kind: &str, body: impl Into<Body>) -> Answer {
-        self.send(Request::put(path).header("content-type", kind).body(body.into()).unwrap()).await
+        self.send(
+            Request::put(path)
+                .header("content-type", kind)
+                .body(body.into())
+                .unwrap(),
+        )
+        .await
     }
 
     /// Sends bytes as a JPEG.
@@ -305,7 +384,9 @@ impl App {
     /// The value of a series, as the metrics show it.
     pub async fn metric(&self, series: &str) -> f64 {
         let text = self.get("/metrics").await.text;
-        let value = text.lines().find_map(|line| line.strip_prefix(series)?.trim().parse().ok());
+        let value = text
+            .lines()
+            .find_map(|line| line.strip_prefix(series)?.trim().parse().ok());
         value.unwrap_or_else(|| panic!("{series} is missing in\n{text}"))
     }
 
@@ -320,26 +401,66 @@ impl App {
 
     pub async fn patch(&self, path: &str, body: &Value) -> Answer {
         let request = Request::patch(path).header("content-type", "application/json");
-        self.send(request.body(Body::from(body.to_string())).unwrap()).await
+        self.send(request.body(Body::from(body.to_string())).unwrap())
+            .await
     }
 
     /// References over all maps, as the listing shows them.
     pub async fn count(&self) -> usize {
-        self.get("/references?limit=1000").await.json["references"].as_array().unwrap().len()
+        self.get("/references?limit=1000").await.json["references"]
+            .as_array()
+            .unwrap()
+            .len()
     }
 }
 
 /// The state of a server and its service, not yet opened.
-pub fn open(directory: &Path, source: Arc<dyn DescriptorSource>, config: Config) -> (AppState, Arc<Service>) {
-    start(Arc::new(SqliteStore::open(directory, &config.store).unwrap()), source, config)
+pub fn open(
+    directory: &Path,
+    source: Arc<dyn DescriptorSource>,
+    config: Config,
+) -> (AppState, Arc<Service>) {
+    start(
+        Arc::new(SqliteStore::open(directory, &config.store).unwrap()),
+        source,
+        config,
+    )
 }
 
-fn start(store: Arc<dyn PlaceStore>, source: Arc<dyn DescriptorSource>, config: Config) -> (AppState, Arc<Service>) {
-    let (metrics, health) = (Arc::new(Metrics::new().unwrap()), Arc::new(Health::default()));
+fn start(
+    store: Arc<dyn PlaceStore>,
+    source: Arc<dyn DescriptorSource>,
+    config: Config,
+) -> (AppState, Arc<Service>) {
+    let (metrics, health) = (
+        Arc::new(Metrics::new().unwrap()),
+        Arc::new(Health::default()),
+    );
     let limit = config.image.max_bytes;
-    let state = AppState::new(config.http.clone(), &config.auth, limit, metrics.clone(), health.clone()).unwrap();
-    let Config { image, rerank, pipeline, .. } = config;
-    let service = Service::start(Parts { store, source, image, rerank, pipeline, metrics, health }).unwrap();
+    let state = AppState::new(
+        config.http.clone(),
+        &config.auth,
+        limit,
+        metrics.clone(),
+        health.clone(),
+    )
+    .unwrap();
+    let Config {
+        image,
+        rerank,
+        pipeline,
+        ..
+    } = config;
+    let service = Service::start(Parts {
+        store,
+        source,
+        image,
+        rerank,
+        pipeline,
+        metrics,
+        health,
+    })
+    .unwrap();
     (state, service)
 }
 
@@ -358,18 +479,28 @@ impl Answer {
         let bytes = body.collect().await.unwrap().to_bytes();
         let text = String::from_utf8_lossy(&bytes).into_owned();
         let json = serde_json::from_str(&text).unwrap_or_default();
-        Self { status: parts.status, headers: parts.headers, text, json }
+        Self {
+            status: parts.status,
+            headers: parts.headers,
+            text,
+            json,
+        }
     }
 
     pub fn header(&self, name: &str) -> &str {
-        self.headers.get(name).map_or("", |value| value.to_str().unwrap())
+        self.headers
+            .get(name)
+            .map_or("", |value| value.to_str().unwrap())
     }
 
     /// Checks that this is the problem `code`, whole and from the table, and returns its detail.
     #[track_caller]
     pub fn problem(&self, code: &str) -> &str {
         assert_eq!(self.json["code"], code, "{}", self.text);
-        let row = placeformer::error::ErrorCode::ALL.iter().find(|row| row.as_str() == code).unwrap();
+        let row = placeformer::error::ErrorCode::ALL
+            .iter()
+            .find(|row| row.as_str() == code)
+            .unwrap();
         assert_eq!(self.status.as_u16(), row.status());
         assert_eq!(self.json["status"], row.status());
         assert_eq!(self.json["title"], row.title());
@@ -399,9 +530,13 @@ impl Answer {
 /// A PNG that no other seed gives.
 pub fn picture(seed: u64) -> Vec<u8> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let pixels = image::RgbImage::from_fn(SIZE.width / 4, SIZE.height / 4, |_, _| image::Rgb(rng.random()));
+    let pixels = image::RgbImage::from_fn(SIZE.width / 4, SIZE.height / 4, |_, _| {
+        image::Rgb(rng.random())
+    });
     let mut bytes = std::io::Cursor::new(Vec::new());
-    pixels.write_to(&mut bytes, image::ImageFormat::Png).unwrap();
+    pixels
+        .write_to(&mut bytes, image::ImageFormat::Png)
+        .unwrap();
     bytes.into_inner()
 }
 
@@ -410,7 +545,9 @@ pub fn multipart(parts: &[(&str, &[u8])]) -> (String, Vec<u8>) {
     let boundary = "b0undary-of-the-test";
     let mut body = Vec::new();
     for (name, content) in parts {
-        let head = format!("--{boundary}\r\ncontent-disposition: form-data; name=\"{name}\"; filename=\"f\"\r\n\r\n");
+        let head = format!(
+            "--{boundary}\r\ncontent-disposition: form-data; name=\"{name}\"; filename=\"f\"\r\n\r\n"
+        );
         body.extend_from_slice(head.as_bytes());
         body.extend_from_slice(content);
         body.extend_from_slice(b"\r\n");

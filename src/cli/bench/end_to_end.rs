@@ -22,7 +22,10 @@ use std::time::{Duration, Instant};
 
 /// Different query photos, sent in turn.
 const PHOTOS: u64 = 32;
-const PHOTO_SIZE: ImageSize = ImageSize { width: 1280, height: 720 };
+const PHOTO_SIZE: ImageSize = ImageSize {
+    width: 1280,
+    height: 720,
+};
 /// Where the drawn references are, within the folder of a run.
 const STORE: &str = "end-to-end";
 
@@ -59,18 +62,29 @@ impl EndToEnd<'_> {
         let store = SqliteStore::open(&directory, &StoreConfig::default())?;
         fill_with_streets(&store, self.extractor, self.drawn)?;
         drop(store);
-        let photos: Vec<Vec<u8>> =
-            (0..PHOTOS).map(|place| street(place * 7, 1, PHOTO_SIZE)).collect::<Result<_, _>>()?;
+        let photos: Vec<Vec<u8>> = (0..PHOTOS)
+            .map(|place| street(place * 7, 1, PHOTO_SIZE))
+            .collect::<Result<_, _>>()?;
         let photos: Arc<[bytes::Bytes]> = photos.into_iter().map(bytes::Bytes::from).collect();
         let prepare = |(python, weights)| {
             let drawn = (self.drawn, crate::bench::REFERENCE_SIZE);
-            Peers::prepare(python, self.folder, (self.extractor, weights), drawn, &photos)
+            Peers::prepare(
+                python,
+                self.folder,
+                (self.extractor, weights),
+                drawn,
+                &photos,
+            )
         };
         let peers = self.peers.map(prepare).transpose()?;
         let runtime = tokio::runtime::Runtime::new()?;
         let mut rows: Vec<EndToEndRow> = Vec::new();
         for &references in self.references {
-            ensure!(references >= self.drawn, "--references {references} are fewer than --drawn {}", self.drawn);
+            ensure!(
+                references >= self.drawn,
+                "--references {references} are fewer than --drawn {}",
+                self.drawn
+            );
             let mut measured = self.at(references, &runtime, &photos)?;
             if let (Some(peers), Some(row)) = (&peers, measured.first_mut()) {
                 say!("{references} references, the peers")?;
@@ -92,17 +106,32 @@ impl EndToEnd<'_> {
         let folder = self.folder.as_os_str().to_owned();
         // The same arguments, so that the model is the same.
         let same = std::env::args_os().skip(1);
-        let serve = [OsString::from("--serve-filled"), extra.into(), "--folder-of-filled".into(), folder];
+        let serve = [
+            OsString::from("--serve-filled"),
+            extra.into(),
+            "--folder-of-filled".into(),
+            folder,
+        ];
         let server = ChildServer::start(same.chain(serve), self.folder.join("server.log"))?;
-        let client = reqwest::Client::builder().timeout(Duration::from_secs(60)).build()?;
+        let client = reqwest::Client::builder()
+            .timeout(Duration::from_secs(60))
+            .build()?;
         let mut rows = Vec::new();
         for &clients in self.clients {
             say!("{references} references, {clients} clients")?;
             let time = Duration::from_secs_f64(self.seconds);
             let (asked, resident) = runtime.block_on(async {
                 let asked = ask(&client, server.url(), photos, clients, time).await?;
-                let metrics = client.get(format!("{}/metrics", server.url())).send().await?.text().await?;
-                anyhow::Ok((asked, resident_bytes(&metrics).context("the server does not tell its memory")?))
+                let metrics = client
+                    .get(format!("{}/metrics", server.url()))
+                    .send()
+                    .await?
+                    .text()
+                    .await?;
+                anyhow::Ok((
+                    asked,
+                    resident_bytes(&metrics).context("the server does not tell its memory")?,
+                ))
             })?;
             rows.push(asked.row(references, clients, resident));
         }
@@ -111,8 +140,13 @@ impl EndToEnd<'_> {
     }
 }
 
-/// What the server process of a measurement does: serves the drawn references in `folder` and `extra` made-up ones.
-pub(super) fn serve_filled(folder: &Path, extra: u64, extract: ExtractConfig) -> anyhow::Result<()> {
+/// What the server process of a measurement does: serves the drawn references in `folder` and
+/// `extra` made-up ones.
+pub(super) fn serve_filled(
+    folder: &Path,
+    extra: u64,
+    extract: ExtractConfig,
+) -> anyhow::Result<()> {
     let directory = folder.join(STORE);
     let mut config = Config::default();
     config.data.directory.clone_from(&directory);
@@ -120,7 +154,10 @@ pub(super) fn serve_filled(folder: &Path, extra: u64, extract: ExtractConfig) ->
     let loaders = Loaders {
         source: Box::new(move || open_model(&extract)),
         store: Box::new(move || {
-            Ok(Arc::new(FilledStore::new(SqliteStore::open(&directory, &StoreConfig::default())?, extra)?))
+            Ok(Arc::new(FilledStore::new(
+                SqliteStore::open(&directory, &StoreConfig::default())?,
+                extra,
+            )?))
         }),
     };
     serve_until_signal(config, loaders)
@@ -136,7 +173,11 @@ struct Asked {
 
 impl Default for Asked {
     fn default() -> Self {
-        Self { latency: histogram(), stages: BTreeMap::new(), elapsed: Duration::ZERO }
+        Self {
+            latency: histogram(),
+            stages: BTreeMap::new(),
+            elapsed: Duration::ZERO,
+        }
     }
 }
 
@@ -151,27 +192,41 @@ impl Asked {
         self.latency.record(latency.as_micros() as u64)?;
         for (stage, ms) in timings.as_object().into_iter().flatten() {
             let micros = ms.as_f64().unwrap_or_default() * 1e3;
-            self.stages.entry(stage.clone()).or_insert_with(histogram).record(micros as u64)?;
+            self.stages
+                .entry(stage.clone())
+                .or_insert_with(histogram)
+                .record(micros as u64)?;
         }
         Ok(())
     }
 
     fn row(&self, references: u64, clients: usize, resident_bytes: u64) -> EndToEndRow {
-        let at = |histogram: &Histogram<u64>, quantile| histogram.value_at_quantile(quantile) as f64 / 1e3;
+        let at = |histogram: &Histogram<u64>, quantile| {
+            histogram.value_at_quantile(quantile) as f64 / 1e3
+        };
         let ours = Measured {
             queries: self.latency.len(),
             p50_ms: at(&self.latency, 0.5),
             p99_ms: at(&self.latency, 0.99),
             queries_per_second: self.latency.len() as f64 / self.elapsed.as_secs_f64(),
-            stages_ms: self.stages.iter().map(|(stage, times)| (stage.clone(), at(times, 0.5))).collect(),
+            stages_ms: self
+                .stages
+                .iter()
+                .map(|(stage, times)| (stage.clone(), at(times, 0.5)))
+                .collect(),
             resident_bytes,
         };
-        EndToEndRow { references, clients, ours, peer: None }
+        EndToEndRow {
+            references,
+            clients,
+            ours,
+            peer: None,
+        }
     }
 }
 
-/// Closed loop: each client asks again as soon as it is answered, until `time` is over. The first answers are not
-/// counted: they warm connections and caches.
+/// Closed loop: each client asks again as soon as it is answered, until `time` is over. The first
+/// answers are not counted: they warm connections and caches.
 async fn ask(
     client: &reqwest::Client,
     url: &str,
@@ -185,14 +240,22 @@ async fn ask(
     }
     let (asked, began) = (Arc::new(Mutex::new(Asked::default())), Instant::now());
     let tasks = (0..clients).map(|number| {
-        let (client, url, photos, asked) = (client.clone(), url.clone(), Arc::clone(photos), Arc::clone(&asked));
+        let (client, url, photos, asked) = (
+            client.clone(),
+            url.clone(),
+            Arc::clone(photos),
+            Arc::clone(&asked),
+        );
         tokio::spawn(async move {
             for photo in photos.iter().cycle().skip(number * 5) {
                 if began.elapsed() >= time {
                     break;
                 }
                 let (latency, timings) = query(&client, &url, photo.clone()).await?;
-                asked.lock().unwrap_or_else(PoisonError::into_inner).add(latency, &timings)?;
+                asked
+                    .lock()
+                    .unwrap_or_else(PoisonError::into_inner)
+                    .add(latency, &timings)?;
             }
             anyhow::Ok(())
         })
@@ -201,7 +264,10 @@ async fn ask(
         task.await??;
     }
     let asked = std::mem::take(&mut *asked.lock().unwrap_or_else(PoisonError::into_inner));
-    Ok(Asked { elapsed: began.elapsed(), ..asked })
+    Ok(Asked {
+        elapsed: began.elapsed(),
+        ..asked
+    })
 }
 
 async fn query(
@@ -210,7 +276,12 @@ async fn query(
     photo: bytes::Bytes,
 ) -> anyhow::Result<(Duration, serde_json::Value)> {
     let started = Instant::now();
-    let answer = client.post(url).header("content-type", "image/jpeg").body(photo).send().await?;
+    let answer = client
+        .post(url)
+        .header("content-type", "image/jpeg")
+        .body(photo)
+        .send()
+        .await?;
     let status = answer.status();
     let mut body: serde_json::Value = answer.json().await?;
     let latency = started.elapsed();

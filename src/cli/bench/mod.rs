@@ -45,14 +45,15 @@ pub struct BenchArgs {
     /// Seconds of each measurement, with --end-to-end.
     #[arg(long, default_value_t = 20.0, requires = "end_to_end")]
     seconds: f64,
-    /// Also measure what users assemble today (OpenVINO, faiss, numpy, OpenCV) with this Python, which needs
-    /// benches/peers/requirements.txt.
+    /// Also measure what users assemble today (OpenVINO, faiss, numpy, OpenCV) with this Python,
+    /// which needs benches/peers/requirements.txt.
     #[arg(long, value_name = "PYTHON", requires = "end_to_end")]
     peers: Option<PathBuf>,
     /// Keep the drawn references here, to measure again sooner; a temporary folder otherwise.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Serve what --end-to-end drew in --folder-of-filled, and this many made-up references: how it starts its server.
+    /// Serve what --end-to-end drew in --folder-of-filled, and this many made-up references: how it
+    /// starts its server.
     #[arg(long, hide = true, value_name = "N", requires = "folder_of_filled")]
     serve_filled: Option<u64>,
     #[arg(long, hide = true, value_name = "DIR")]
@@ -77,7 +78,9 @@ struct Report {
 /// Runs it.
 pub fn run(args: BenchArgs) -> anyhow::Result<()> {
     if cfg!(debug_assertions) {
-        eprintln!("warning: this is a development build; its times mean nothing (cargo build --release)");
+        eprintln!(
+            "warning: this is a development build; its times mean nothing (cargo build --release)"
+        );
     }
     let simd = kernels::self_check()?;
     if let (Some(extra), Some(folder)) = (args.serve_filled, &args.folder_of_filled) {
@@ -112,7 +115,14 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
         report.end_to_end = plan.measure()?;
     } else {
         let spec = config.encoder_spec()?;
-        let bench = Bench { extractor, weights, spec, limits, folder, rounds: args.rounds as usize };
+        let bench = Bench {
+            extractor,
+            weights,
+            spec,
+            limits,
+            folder,
+            rounds: args.rounds as usize,
+        };
         report.rows = rows(&bench, &args.only)?;
     }
     if let Some(path) = &args.json {
@@ -128,12 +138,19 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
 
 fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<Row>> {
     for name in only {
-        ensure!(NAMES.contains(&name.as_str()), "there is no row {name:?}; there are {}", NAMES.join(", "));
+        ensure!(
+            NAMES.contains(&name.as_str()),
+            "there is no row {name:?}; there are {}",
+            NAMES.join(", ")
+        );
     }
-    let wanted = |name: &&str| only.iter().any(|wanted| wanted == name) || only.is_empty() && *name != "search_10m";
+    let wanted = |name: &&str| {
+        only.iter().any(|wanted| wanted == name) || only.is_empty() && *name != "search_10m"
+    };
     let names: Vec<&str> = NAMES.into_iter().filter(wanted).collect();
-    let bar = ProgressBar::new(names.len() as u64)
-        .with_style(ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} {elapsed}")?);
+    let bar = ProgressBar::new(names.len() as u64).with_style(ProgressStyle::with_template(
+        "{msg} [{bar:40}] {pos}/{len} {elapsed}",
+    )?);
     bar.enable_steady_tick(Duration::from_millis(500));
     let mut rows = Vec::new();
     for name in names {

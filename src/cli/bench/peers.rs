@@ -44,11 +44,15 @@ impl<'a> Peers<'a> {
         (drawn, size): (u64, ImageSize),
         queries: &[bytes::Bytes],
     ) -> anyhow::Result<Self> {
-        ensure!(Path::new(SCRIPT).exists(), "{SCRIPT} is not here: run --peers in the project's folder");
+        ensure!(
+            Path::new(SCRIPT).exists(),
+            "{SCRIPT} is not here: run --peers in the project's folder"
+        );
         let folder = folder.join("peers");
         let photo = |kind: &str, number: u64| folder.join(kind).join(format!("{number:06}.jpg"));
         for kind in ["references", "queries", "patches"] {
-            std::fs::create_dir_all(folder.join(kind)).with_context(|| folder.display().to_string())?;
+            std::fs::create_dir_all(folder.join(kind))
+                .with_context(|| folder.display().to_string())?;
         }
         for place in (0..drawn).filter(|&place| !photo("references", place).exists()) {
             std::fs::write(photo("references", place), street(place, 0, size)?)?;
@@ -56,10 +60,22 @@ impl<'a> Peers<'a> {
         for (number, query) in (0..).zip(queries) {
             std::fs::write(photo("queries", number), query)?;
         }
-        extractor.head().context("the peers need a head too")?.save(&folder.join("head.safetensors"))?;
-        let exit_block = extractor.config().exit_block.context("the settings in force name an exit block")?;
+        extractor
+            .head()
+            .context("the peers need a head too")?
+            .save(&folder.join("head.safetensors"))?;
+        let exit_block = extractor
+            .config()
+            .exit_block
+            .context("the settings in force name an exit block")?;
         let size = extractor.input_size().to_string();
-        Ok(Self { python, folder, weights: weights.to_owned(), size, exit_block })
+        Ok(Self {
+            python,
+            folder,
+            weights: weights.to_owned(),
+            size,
+            exit_block,
+        })
     }
 
     /// Runs the script for `seconds` at a map of `references`.
@@ -67,16 +83,33 @@ impl<'a> Peers<'a> {
         let output = Command::new(self.python)
             .arg(SCRIPT)
             .args(["--weights".as_ref(), self.weights.as_os_str()])
-            .args(["--head".as_ref(), self.folder.join("head.safetensors").as_os_str()])
+            .args([
+                "--head".as_ref(),
+                self.folder.join("head.safetensors").as_os_str(),
+            ])
             .args(["--photos".as_ref(), self.folder.as_os_str()])
             .args(["--work".as_ref(), self.folder.join("patches").as_os_str()])
-            .args(["--references", &references.to_string(), "--seconds", &seconds.to_string()])
-            .args(["--size", &self.size, "--exit-block", &self.exit_block.to_string()])
+            .args([
+                "--references",
+                &references.to_string(),
+                "--seconds",
+                &seconds.to_string(),
+            ])
+            .args([
+                "--size",
+                &self.size,
+                "--exit-block",
+                &self.exit_block.to_string(),
+            ])
             .args(["--threads", &rayon::current_num_threads().to_string()])
             .stderr(Stdio::inherit())
             .output()
             .with_context(|| format!("cannot start {}", self.python.display()))?;
-        ensure!(output.status.success(), "{SCRIPT} failed: {}", output.status);
+        ensure!(
+            output.status.success(),
+            "{SCRIPT} failed: {}",
+            output.status
+        );
         let text = String::from_utf8_lossy(&output.stdout);
         let last = text.lines().last().unwrap_or_default();
         serde_json::from_str(last).with_context(|| format!("{SCRIPT} printed {last:?}"))

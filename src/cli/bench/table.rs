@@ -8,7 +8,8 @@ use std::fmt::Write;
 /// What it ran on.
 pub(super) fn machine(report: &Report) -> String {
     let limits = &report.limits;
-    let optional = |value: Option<f64>| value.map_or("none".to_owned(), |value| format!("{value:.0}"));
+    let optional =
+        |value: Option<f64>| value.map_or("none".to_owned(), |value| format!("{value:.0}"));
     format!(
         "{} threads at {}; at most {:.0} GFLOP/s f32, {} bf16, {} GOP/s int8; memory {:.1} GB/s; encoder {}",
         report.threads,
@@ -23,8 +24,10 @@ pub(super) fn machine(report: &Report) -> String {
 
 /// One line per stage.
 pub(super) fn rows(rows: &[Row]) -> String {
-    let mut text =
-        format!("{:<20} {:>10} {:>12} {:>7} {:>9}  baseline\n", "stage", "ours ms", "baseline ms", "ratio", "of limit");
+    let mut text = format!(
+        "{:<20} {:>10} {:>12} {:>7} {:>9}  baseline\n",
+        "stage", "ours ms", "baseline ms", "ratio", "of limit"
+    );
     for row in rows {
         let share = format!("{:.0}%", row.limit_share * 100.0);
         // Cannot fail: writing to a String.
@@ -44,17 +47,33 @@ pub(super) fn end_to_end(rows: &[EndToEndRow]) -> String {
         "references", "clients", "queries", "p50 ms", "p99 ms", "q/s"
     );
     for row in rows {
-        let _ = writeln!(text, "{:>10} {:>7} {}", row.references, row.clients, measured(&row.ours));
+        let _ = writeln!(
+            text,
+            "{:>10} {:>7} {}",
+            row.references,
+            row.clients,
+            measured(&row.ours)
+        );
         if let Some(peer) = &row.peer {
             let times = peer.p50_ms / row.ours.p50_ms;
-            let _ = writeln!(text, "{:>10} {:>7} {} ({times:.1} times ours)", "peers", 1, measured(peer));
+            let _ = writeln!(
+                text,
+                "{:>10} {:>7} {} ({times:.1} times ours)",
+                "peers",
+                1,
+                measured(peer)
+            );
         }
     }
     text
 }
 
 fn measured(of: &Measured) -> String {
-    let stages: Vec<String> = of.stages_ms.iter().map(|(stage, ms)| format!("{stage} {ms:.1}")).collect();
+    let stages: Vec<String> = of
+        .stages_ms
+        .iter()
+        .map(|(stage, ms)| format!("{stage} {ms:.1}"))
+        .collect();
     format!(
         "{:>8} {:>9.1} {:>9.1} {:>8.2}  {}; {} MiB resident",
         of.queries,

@@ -1,8 +1,9 @@
 //! Serve a demo map, query it, write a report.
 //!
-//! What a new user would do by hand, done for them and shown: draw a small town, start the server, import the photos,
-//! ask where each query was taken, picture the evidence, stop. Every step runs this same program through its public
-//! commands and its HTTP surface, so a demo that works is a product that works.
+//! What a new user would do by hand, done for them and shown: draw a small town, start the server,
+//! import the photos, ask where each query was taken, picture the evidence, stop. Every step runs
+//! this same program through its public commands and its HTTP surface, so a demo that works is a
+//! product that works.
 
 mod report;
 
@@ -28,7 +29,8 @@ const CANDIDATES: usize = 100;
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
 pub struct DemoArgs {
-    /// Folder for the town, the store, the server's log and the report; emptied if an earlier demo made it.
+    /// Folder for the town, the store, the server's log and the report; emptied if an earlier demo
+    /// made it.
     #[arg(long, default_value = "demo-report", value_name = "DIR")]
     out: PathBuf,
     /// Places of the town.
@@ -51,26 +53,50 @@ pub fn run(args: DemoArgs) -> anyhow::Result<()> {
     prepare(&args.out)?;
     resolve_weights(&ExtractConfig::default()).context("the demo needs the default model")?;
 
-    say!("\n1. Draw a town of {} places, {} photos each", args.places, args.views)?;
-    let (places, views, seed) = (args.places.to_string(), args.views.to_string(), args.seed.to_string());
+    say!(
+        "\n1. Draw a town of {} places, {} photos each",
+        args.places,
+        args.views
+    )?;
+    let (places, views, seed) = (
+        args.places.to_string(),
+        args.views.to_string(),
+        args.seed.to_string(),
+    );
     let options = ["--places", &places, "--views", &views, "--seed", &seed];
     placeformer(&[&["synth", "--out", text(&town)?], &options[..]].concat())?;
 
     say!("\n2. Start the server")?;
     let data = args.out.join("data");
-    say!("   $ placeformer serve --listen 127.0.0.1:0 --data {}", data.display())?;
-    let arguments = ["serve", "--listen", "127.0.0.1:0", "--data"].map(OsString::from).into_iter();
+    say!(
+        "   $ placeformer serve --listen 127.0.0.1:0 --data {}",
+        data.display()
+    )?;
+    let arguments = ["serve", "--listen", "127.0.0.1:0", "--data"]
+        .map(OsString::from)
+        .into_iter();
     let server = ChildServer::start(arguments.chain([data.into()]), args.out.join("server.log"))?;
     say!("   ready at {}", server.url())?;
 
     say!("\n3. Import the photos into the map {MAP:?}")?;
     let started = Instant::now();
     let database = town.join("database");
-    placeformer(&["import", text(&database)?, "--map", MAP, "--server", server.url()])?;
+    placeformer(&[
+        "import",
+        text(&database)?,
+        "--map",
+        MAP,
+        "--server",
+        server.url(),
+    ])?;
     let import_seconds = started.elapsed().as_secs_f64();
 
     say!("\n4. Ask where each query photo was taken")?;
-    let client = ServerClient::new(ServerArgs { server: server.url().into(), api_key: None, timeout: 60 })?;
+    let client = ServerClient::new(ServerArgs {
+        server: server.url().into(),
+        api_key: None,
+        timeout: 60,
+    })?;
     let truth = read_truth(&town.join("ground_truth.csv"))?;
     let asked = ask_all(&client, &town.join("queries"), &truth)?;
     report::print_table(&asked)?;
@@ -84,7 +110,10 @@ pub fn run(args: DemoArgs) -> anyhow::Result<()> {
 
     say!("\n{}", report::summary(&asked))?;
     say!("report: {}", path.display())?;
-    say!("ask more:  placeformer serve --data {}", args.out.join("data").display())?;
+    say!(
+        "ask more:  placeformer serve --data {}",
+        args.out.join("data").display()
+    )?;
     Ok(())
 }
 
@@ -92,9 +121,13 @@ pub fn run(args: DemoArgs) -> anyhow::Result<()> {
 fn prepare(out: &Path) -> anyhow::Result<()> {
     let marker = out.join(MARKER);
     if out.exists() && !marker.exists() {
-        let mut entries = std::fs::read_dir(out).with_context(|| format!("cannot read {}", out.display()))?;
+        let mut entries =
+            std::fs::read_dir(out).with_context(|| format!("cannot read {}", out.display()))?;
         if entries.next().is_some() {
-            bail!("{} holds files that no demo made; choose another --out", out.display());
+            bail!(
+                "{} holds files that no demo made; choose another --out",
+                out.display()
+            );
         }
     }
     if marker.exists() {
@@ -109,19 +142,30 @@ fn prepare(out: &Path) -> anyhow::Result<()> {
 fn placeformer(arguments: &[&str]) -> anyhow::Result<()> {
     say!("   $ placeformer {}", arguments.join(" "))?;
     let program = std::env::current_exe().context("cannot find this program's own file")?;
-    let status = Command::new(program).args(arguments).status().context("cannot start a subcommand")?;
-    ensure!(status.success(), "placeformer {} failed", arguments.first().copied().unwrap_or_default());
+    let status = Command::new(program)
+        .args(arguments)
+        .status()
+        .context("cannot start a subcommand")?;
+    ensure!(
+        status.success(),
+        "placeformer {} failed",
+        arguments.first().copied().unwrap_or_default()
+    );
     Ok(())
 }
 
 fn text(path: &Path) -> anyhow::Result<&str> {
-    path.to_str().with_context(|| format!("{} is not a name in UTF-8", path.display()))
+    path.to_str()
+        .with_context(|| format!("{} is not a name in UTF-8", path.display()))
 }
 
 /// For every query the references that show its place; none where the place is not mapped.
 fn read_truth(path: &Path) -> anyhow::Result<BTreeMap<String, BTreeSet<String>>> {
     let mut truth: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
-    for row in csv::Reader::from_path(path).with_context(|| format!("cannot read {}", path.display()))?.deserialize() {
+    for row in csv::Reader::from_path(path)
+        .with_context(|| format!("cannot read {}", path.display()))?
+        .deserialize()
+    {
         let (query, reference): (String, String) = row?;
         let references = truth.entry(query).or_default();
         if !reference.is_empty() {
@@ -136,32 +180,53 @@ fn ask_all(
     queries: &Path,
     truth: &BTreeMap<String, BTreeSet<String>>,
 ) -> anyhow::Result<Vec<Asked>> {
-    let parameters =
-        [("map", MAP.to_owned()), ("top_k", CANDIDATES.to_string()), ("candidates", CANDIDATES.to_string())];
+    let parameters = [
+        ("map", MAP.to_owned()),
+        ("top_k", CANDIDATES.to_string()),
+        ("candidates", CANDIDATES.to_string()),
+    ];
     truth
         .iter()
         .map(|(query, right)| {
             let answer: Value = client.post_image("/query", &queries.join(query), &parameters)?;
-            Asked::read(query, right, &answer).with_context(|| format!("the answer to {query} has an unknown shape"))
+            Asked::read(query, right, &answer)
+                .with_context(|| format!("the answer to {query} has an unknown shape"))
         })
         .collect()
 }
 
-/// Queries on which re-ranking changed the answer first, then those with the most and the fewest inliers.
-fn picture(town: &Path, out: &Path, asked: &[Asked], wanted: usize) -> anyhow::Result<Vec<Evidence>> {
-    let mut order: Vec<usize> = (0..asked.len()).filter(|&i| !asked[i].results.is_empty()).collect();
+/// Queries on which re-ranking changed the answer first, then those with the most and the fewest
+/// inliers.
+fn picture(
+    town: &Path,
+    out: &Path,
+    asked: &[Asked],
+    wanted: usize,
+) -> anyhow::Result<Vec<Evidence>> {
+    let mut order: Vec<usize> = (0..asked.len())
+        .filter(|&i| !asked[i].results.is_empty())
+        .collect();
     order.sort_by_key(|&i| std::cmp::Reverse((asked[i].reranking_helped(), asked[i].best_score())));
     let fewest = wanted / 3;
-    let chosen = order.iter().take(wanted - fewest).chain(order.iter().rev().take(fewest));
+    let chosen = order
+        .iter()
+        .take(wanted - fewest)
+        .chain(order.iter().rev().take(fewest));
     let chosen: BTreeSet<usize> = chosen.copied().collect();
     let mut evidence = Vec::new();
     for index in order.into_iter().filter(|index| chosen.contains(index)) {
         let query = &asked[index];
         let reference = &query.results[0].reference;
         let picture = out.join(format!("match-{}.png", evidence.len() + 1));
-        let (a, b) = (town.join("queries").join(&query.query), town.join("database").join(reference));
+        let (a, b) = (
+            town.join("queries").join(&query.query),
+            town.join("database").join(reference),
+        );
         placeformer(&["match", text(&a)?, text(&b)?, "--out", text(&picture)?])?;
-        evidence.push(Evidence { asked: index, picture });
+        evidence.push(Evidence {
+            asked: index,
+            picture,
+        });
     }
     Ok(evidence)
 }

@@ -45,19 +45,43 @@ impl Asked {
         let found = |result: &Value| {
             let reference = result["external_id"].as_str()?.to_owned();
             let right = right.contains(&reference);
-            let (distance, score) = (result["global_distance"].as_f64()?, result["spatial_score"].as_u64()?);
-            Some(Found { reference, distance, score, right })
+            let (distance, score) = (
+                result["global_distance"].as_f64()?,
+                result["spatial_score"].as_u64()?,
+            );
+            Some(Found {
+                reference,
+                distance,
+                score,
+                right,
+            })
         };
-        let results = answer["results"].as_array()?.iter().map(found).collect::<Option<_>>()?;
+        let results = answer["results"]
+            .as_array()?
+            .iter()
+            .map(found)
+            .collect::<Option<_>>()?;
         let stages = answer["timings_ms"].as_object()?.iter();
-        let stages = stages.map(|(stage, ms)| Some((stage.clone(), ms.as_f64()?))).collect::<Option<_>>()?;
-        let trust = answer["matched"].as_bool().zip(answer["confidence"].as_f64());
-        Some(Self { query: query.into(), mapped: !right.is_empty(), results, trust, stages })
+        let stages = stages
+            .map(|(stage, ms)| Some((stage.clone(), ms.as_f64()?)))
+            .collect::<Option<_>>()?;
+        let trust = answer["matched"]
+            .as_bool()
+            .zip(answer["confidence"].as_f64());
+        Some(Self {
+            query: query.into(),
+            mapped: !right.is_empty(),
+            results,
+            trust,
+            stages,
+        })
     }
 
     /// The answer without re-ranking.
     fn global_best(&self) -> Option<&Found> {
-        self.results.iter().min_by(|a, b| a.distance.total_cmp(&b.distance))
+        self.results
+            .iter()
+            .min_by(|a, b| a.distance.total_cmp(&b.distance))
     }
 
     fn right(&self) -> bool {
@@ -81,7 +105,11 @@ impl Asked {
     /// `97%`, with a question mark where the server does not trust it.
     fn confidence(&self) -> String {
         self.trust.map_or("-".into(), |(matched, confidence)| {
-            format!("{:.0}%{}", 100.0 * confidence, if matched { "" } else { "?" })
+            format!(
+                "{:.0}%{}",
+                100.0 * confidence,
+                if matched { "" } else { "?" }
+            )
         })
     }
 
@@ -108,7 +136,10 @@ pub(super) fn print_table(asked: &[Asked]) -> Result<(), OutputError> {
         "re-rank"
     )?;
     for one in asked {
-        let best = one.results.first().map_or("-".into(), |best| place_and_view(&best.reference));
+        let best = one
+            .results
+            .first()
+            .map_or("-".into(), |best| place_and_view(&best.reference));
         let stage = |name: &str| one.stages.get(name).copied().unwrap_or_default();
         say!(
             "   {:<12} {best:<14} {:>5} {:>6} {:>6.0} ms {:>5.2} ms {:>5.0} ms  {}",
@@ -135,7 +166,11 @@ pub(super) fn summary(asked: &[Asked]) -> String {
     let unmapped = asked.iter().filter(|one| !one.mapped);
     let globally = mapped.iter().filter(|one| one.globally_right()).count();
     let reranked = mapped.iter().filter(|one| one.right()).count();
-    let lowest_right = mapped.iter().filter(|one| one.right()).map(|one| one.best_score()).min();
+    let lowest_right = mapped
+        .iter()
+        .filter(|one| one.right())
+        .map(|one| one.best_score())
+        .min();
     let highest_unmapped = unmapped.map(Asked::best_score).max();
     let mut text = format!(
         "Right at rank 1: {globally} of {} by the global descriptor alone, {reranked} after re-ranking.",
@@ -146,7 +181,10 @@ pub(super) fn summary(asked: &[Asked]) -> String {
             "\nPlaces that are not in the map score at most S = {highest}; right answers score at least {lowest}."
         );
     }
-    let trusted: Vec<&Asked> = asked.iter().filter(|one| one.trust.is_some_and(|(matched, _)| matched)).collect();
+    let trusted: Vec<&Asked> = asked
+        .iter()
+        .filter(|one| one.trust.is_some_and(|(matched, _)| matched))
+        .collect();
     if asked.iter().any(|one| one.trust.is_some()) {
         let right = trusted.iter().filter(|one| one.right()).count();
         text += &format!(
@@ -170,7 +208,12 @@ pub(super) fn write(
     let mut body = format!(
         "<p class=\"lead\">{}</p>\n<p>Model <code>{}</code>; importing took {import_seconds:.1} s.</p>\n",
         escape(&summary(asked)),
-        escape(info["model"]["id"].as_str().or(info["model"].as_str()).unwrap_or("unknown"))
+        escape(
+            info["model"]["id"]
+                .as_str()
+                .or(info["model"].as_str())
+                .unwrap_or("unknown")
+        )
     );
     body += &all_queries(asked);
     body += "<h2>The evidence</h2>\n<p>Above: attention, with the key patches of three scales as squares. Below, for \
@@ -178,14 +221,16 @@ pub(super) fn write(
     for one in evidence {
         body += &figure(town, &asked[one.asked], &one.picture)?;
     }
-    std::fs::write(path, page("PlaceFormer demo", &body)).with_context(|| format!("cannot write {}", path.display()))
+    std::fs::write(path, page("PlaceFormer demo", &body))
+        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 fn all_queries(asked: &[Asked]) -> String {
     let rows: Vec<Vec<String>> = asked
         .iter()
         .map(|one| {
-            let name = |found: Option<&Found>| found.map_or("-".into(), |found| escape(&found.reference));
+            let name =
+                |found: Option<&Found>| found.map_or("-".into(), |found| escape(&found.reference));
             let total: f64 = one.stages.values().sum();
             vec![
                 escape(&one.query),
@@ -198,7 +243,15 @@ fn all_queries(asked: &[Asked]) -> String {
             ]
         })
         .collect();
-    let headers = ["Query", "Best by global descriptor", "Best after re-ranking", "S", "Sure", "ms", "Verdict"];
+    let headers = [
+        "Query",
+        "Best by global descriptor",
+        "Best after re-ranking",
+        "S",
+        "Sure",
+        "ms",
+        "Verdict",
+    ];
     table("Every query of the demo", &headers, &rows)
 }
 
@@ -212,11 +265,25 @@ fn figure(town: &Path, asked: &Asked, picture: &Path) -> anyhow::Result<String> 
         ))
     };
     let class = |right: bool| if right { "right" } else { "wrong" };
-    let mut html = format!("<h3>{} &mdash; {}</h3>\n<div class=\"row\">", escape(&asked.query), asked.verdict());
+    let mut html = format!(
+        "<h3>{} &mdash; {}</h3>\n<div class=\"row\">",
+        escape(&asked.query),
+        asked.verdict()
+    );
     html += &photo("queries", &asked.query, "query", "")?;
     if let (Some(before), Some(after)) = (asked.global_best(), asked.results.first()) {
-        html += &photo("database", &before.reference, "best by the global descriptor", class(before.right))?;
-        html += &photo("database", &after.reference, "best after re-ranking", class(after.right))?;
+        html += &photo(
+            "database",
+            &before.reference,
+            "best by the global descriptor",
+            class(before.right),
+        )?;
+        html += &photo(
+            "database",
+            &after.reference,
+            "best after re-ranking",
+            class(after.right),
+        )?;
     }
     html += &format!(
         "</div>\n<img src=\"{}\" alt=\"Key patches and inlier lines of {} and its best reference\">\n",
@@ -228,6 +295,7 @@ fn figure(town: &Path, asked: &Asked, picture: &Path) -> anyhow::Result<String> 
 
 fn embed(path: &Path, longest_side: u32) -> anyhow::Result<String> {
     let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let image = decode(&bytes, &ImageConfig::default()).with_context(|| path.display().to_string())?;
+    let image =
+        decode(&bytes, &ImageConfig::default()).with_context(|| path.display().to_string())?;
     Ok(jpeg_data_uri(&thumbnail(&image, longest_side)?, 85)?)
 }

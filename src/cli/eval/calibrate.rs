@@ -61,7 +61,11 @@ struct OutputArgs {
 
 fn parse_share(text: &str) -> Result<f64, String> {
     let share: f64 = text.parse().map_err(|_| "it is not a number".to_owned())?;
-    if share > 0.0 && share <= 1.0 { Ok(share) } else { Err("use a share above 0 and up to 1, such as 0.99".into()) }
+    if share > 0.0 && share <= 1.0 {
+        Ok(share)
+    } else {
+        Err("use a share above 0 and up to 1, such as 0.99".into())
+    }
 }
 
 /// Runs it.
@@ -71,7 +75,12 @@ pub(super) fn run(args: CalibrateArgs) -> anyhow::Result<()> {
     let extract = args.model.extract_config()?;
     let described = Described::new(&extract, &args.output.cache, &dataset, GlobalKind::Head)?;
     let own = OwnPlaces::of(&dataset, args.fit.leave_out, args.data.radius);
-    let answered = described.answer(&dataset, own.as_ref(), args.rerank.candidates, Some(&args.rerank.config()))?;
+    let answered = described.answer(
+        &dataset,
+        own.as_ref(),
+        args.rerank.candidates,
+        Some(&args.rerank.config()),
+    )?;
     let answers = BestAnswers::of(&dataset, &answered.answers, &answered.left_out);
     let fitted = calibrate(
         &answers,
@@ -85,7 +94,10 @@ pub(super) fn run(args: CalibrateArgs) -> anyhow::Result<()> {
     )?;
     say_part!("{}", fitted.text())?;
     if let Some(path) = &args.output.out {
-        write(path, &(serde_json::to_string_pretty(&fitted.calibration)? + "\n"))?;
+        write(
+            path,
+            &(serde_json::to_string_pretty(&fitted.calibration)? + "\n"),
+        )?;
     }
     if let Some(map) = &args.output.map {
         store(args.server, map, &fitted.calibration)?;
@@ -98,7 +110,10 @@ fn store(server: ServerArgs, map: &MapName, calibration: &Calibration) -> anyhow
     let client = ServerClient::new(server)?;
     let stored = client.put_json(&format!("/maps/{map}/calibration"), calibration);
     let stored = stored.with_context(|| format!("cannot store the calibration with map {map}"))?;
-    ensure!(stored["model"] == calibration.model().as_str(), "the server stored something else: {stored}");
+    ensure!(
+        stored["model"] == calibration.model().as_str(),
+        "the server stored something else: {stored}"
+    );
     eprintln!("stored with map {map} at {address}");
     Ok(())
 }

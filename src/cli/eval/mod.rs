@@ -43,15 +43,16 @@ pub struct EvalArgs {
 enum Action {
     /// Fit how far best answers can be trusted.
     ///
-    /// Every query is answered as the service would, and two curves are fitted to what the best answers were worth:
-    /// one on S and global distance for re-ranked answers, one on the distance alone for the others. An answer is
-    /// trusted from the confidence on at which the share of right ones reaches --target-precision (cross-validated,
-    /// never below 0.5).
+    /// Every query is answered as the service would, and two curves are fitted to what the best
+    /// answers were worth: one on S and global distance for re-ranked answers, one on the distance
+    /// alone for the others. An answer is trusted from the confidence on at which the share of
+    /// right ones reaches --target-precision (cross-validated, never below 0.5).
     ///
-    /// Queries without a match come from the ground truth (an empty reference). Where it has none, every query is
-    /// asked twice, the second time with its own place left out of the database: its positives and, where positions
-    /// are known, all images within four times the radius. Confidences hold for the mix of known and unknown places
-    /// they were fitted on; half and half is what leaving out gives.
+    /// Queries without a match come from the ground truth (an empty reference). Where it has none,
+    /// every query is asked twice, the second time with its own place left out of the database: its
+    /// positives and, where positions are known, all images within four times the radius.
+    /// Confidences hold for the mix of known and unknown places they were fitted on; half and half
+    /// is what leaving out gives.
     Calibrate(Box<calibrate::CalibrateArgs>),
 }
 
@@ -72,16 +73,28 @@ struct MeasureArgs {
 #[command(next_help_heading = "Data set")]
 struct DataArgs {
     /// Folder of reference images.
-    #[arg(long, value_name = "DIR", requires = "queries", requires = "ground_truth", conflicts_with = "dataset")]
+    #[arg(
+        long,
+        value_name = "DIR",
+        requires = "queries",
+        requires = "ground_truth",
+        conflicts_with = "dataset"
+    )]
     database: Option<PathBuf>,
     /// Folder of query images.
     #[arg(long, value_name = "DIR", requires = "database")]
     queries: Option<PathBuf>,
-    /// CSV `query,reference`, one accepted pair a row; an empty reference says that no match exists.
+    /// CSV `query,reference`, one accepted pair a row; an empty reference says that no match
+    /// exists.
     #[arg(long, value_name = "CSV", requires = "database")]
     ground_truth: Option<PathBuf>,
     /// A data set in the layout in which it is distributed.
-    #[arg(long, value_enum, requires = "root", required_unless_present = "database")]
+    #[arg(
+        long,
+        value_enum,
+        requires = "root",
+        required_unless_present = "database"
+    )]
     dataset: Option<DatasetKind>,
     /// Where that data set lies.
     #[arg(long, value_name = "DIR", requires = "dataset")]
@@ -91,7 +104,8 @@ struct DataArgs {
     /// Greatest distance of a positive in metres.
     #[arg(long, default_value_t = 25.0, value_name = "METRES")]
     radius: f64,
-    /// Greatest difference of view angles of a positive in degrees [default: 40 for MSLS, else no rule].
+    /// Greatest difference of view angles of a positive in degrees [default: 40 for MSLS, else no
+    /// rule].
     #[arg(long, value_name = "DEGREES")]
     max_angle: Option<f64>,
     /// Greatest frame distance of a positive (Nordland).
@@ -114,19 +128,25 @@ struct MethodArgs {
     /// Leave re-ranking out.
     #[arg(long)]
     no_rerank: bool,
-    /// Ask every query a second time with its own place left out of the database (its positives, and all within four
-    /// times the radius), so that rejection is measured where the ground truth names no unknown place. Recall is that of
-    /// the first time; times are those of both.
+    /// Ask every query a second time with its own place left out of the database (its positives,
+    /// and all within four times the radius), so that rejection is measured where the ground truth
+    /// names no unknown place. Recall is that of the first time; times are those of both.
     #[arg(long)]
     leave_out: bool,
-    /// Show how far the confidences of this calibration (of `eval calibrate --out`) can be believed here.
+    /// Show how far the confidences of this calibration (of `eval calibrate --out`) can be believed
+    /// here.
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
     /// Repeat along the axes of the paper's ablation tables.
     #[arg(long)]
     ablate: bool,
     /// Backbones the ablation compares; their weights are pulled if they are missing.
-    #[arg(long, value_delimiter = ',', value_name = "PRESET,...", requires = "ablate")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "PRESET,...",
+        requires = "ablate"
+    )]
     backbones: Vec<Preset>,
     /// Bootstrap resamples behind the 95% intervals.
     #[arg(long, default_value_t = 2000, value_name = "N")]
@@ -144,7 +164,12 @@ struct RerankArgs {
     #[arg(long, default_value_t = 100, value_name = "N")]
     candidates: usize,
     /// Scale combinations whose inliers add up to S.
-    #[arg(long, value_delimiter = ',', default_value = "1,1+2,2+3", value_name = "SET,...")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_value = "1,1+2,2+3",
+        value_name = "SET,..."
+    )]
     scales: Vec<ScaleSet>,
 }
 
@@ -202,7 +227,9 @@ fn run_measure(args: MeasureArgs) -> anyhow::Result<()> {
     let mut json = serde_json::to_value(&measured.summary)?;
     if args.method.ablate {
         let Ablation { rows, left_out } = run_ablation(&args, &dataset, &extract)?;
-        left_out.iter().for_each(|row| eprintln!("left out {row} (--patch-memory)"));
+        left_out
+            .iter()
+            .for_each(|row| eprintln!("left out {row} (--patch-memory)"));
         say_part!("\n{}", report::ablation_text(&rows))?;
         details += &report::ablation_html(&rows);
         json["ablation"] = serde_json::to_value(&rows)?;
@@ -213,10 +240,19 @@ fn run_measure(args: MeasureArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.output.html {
         let limits = ImageConfig::default();
         let reranker = Reranker::new(args.method.rerank.config());
-        let painter = Painter { extractor: &measured.extractor, limits: &limits, reranker: &reranker };
-        let Answered { answers, left_out, .. } = &measured.answered;
+        let painter = Painter {
+            extractor: &measured.extractor,
+            limits: &limits,
+            reranker: &reranker,
+        };
+        let Answered {
+            answers, left_out, ..
+        } = &measured.answered;
         details += &gallery(&painter, &dataset, answers, args.output.pictures)?;
-        write(path, &report::html(&measured.summary, &dataset, answers, left_out, &details))?;
+        write(
+            path,
+            &report::html(&measured.summary, &dataset, answers, left_out, &details),
+        )?;
     }
     Ok(())
 }
@@ -237,12 +273,25 @@ impl DataArgs {
             ..self.reading.options()
         };
         options.check()?;
-        let dataset = match (&self.database, &self.queries, &self.ground_truth, self.dataset, &self.root) {
-            (Some(database), Some(queries), Some(truth), ..) => datasets::load_pairs(database, queries, truth)?,
+        let dataset = match (
+            &self.database,
+            &self.queries,
+            &self.ground_truth,
+            self.dataset,
+            &self.root,
+        ) {
+            (Some(database), Some(queries), Some(truth), ..) => {
+                datasets::load_pairs(database, queries, truth)?
+            }
             (_, _, _, Some(kind), Some(root)) => datasets::load(kind, root, &options)?,
             _ => bail!("give --dataset and --root, or --database, --queries and --ground-truth"),
         };
-        eprintln!("{}: {} references, {} queries", dataset.name, dataset.database.len(), dataset.queries.len());
+        eprintln!(
+            "{}: {} references, {} queries",
+            dataset.name,
+            dataset.database.len(),
+            dataset.queries.len()
+        );
         Ok(dataset)
     }
 }
@@ -263,7 +312,10 @@ impl RerankArgs {
     }
 
     fn config(&self) -> RerankConfig {
-        RerankConfig { scales: self.scales.clone(), ..Default::default() }
+        RerankConfig {
+            scales: self.scales.clone(),
+            ..Default::default()
+        }
     }
 }
 
@@ -276,13 +328,17 @@ struct Measured {
 /// The answers to a data set.
 struct Answered {
     answers: Vec<Answer>,
-    /// Those to the same queries with their own place left out of the database, if they were asked so too.
+    /// Those to the same queries with their own place left out of the database, if they were asked
+    /// so too.
     left_out: Vec<Answer>,
     seconds: QuerySeconds,
 }
 
 fn describer(config: &ExtractConfig) -> anyhow::Result<ModelDescriber> {
-    Ok(ModelDescriber { extractor: Extractor::open(config)?, limits: ImageConfig::default() })
+    Ok(ModelDescriber {
+        extractor: Extractor::open(config)?,
+        limits: ImageConfig::default(),
+    })
 }
 
 /// Both sides of a data set, described.
@@ -294,21 +350,37 @@ struct Described {
 }
 
 impl Described {
-    fn new(extract: &ExtractConfig, cache: &CacheArgs, dataset: &Dataset, global: GlobalKind) -> anyhow::Result<Self> {
+    fn new(
+        extract: &ExtractConfig,
+        cache: &CacheArgs,
+        dataset: &Dataset,
+        global: GlobalKind,
+    ) -> anyhow::Result<Self> {
         let describer = describer(extract)?;
         let cache = FeatureCache::open(&cache.folder()?, &describer, cache.patch_memory << 20)?;
         let images = dataset.database.len() + dataset.queries.len();
         let bar = bar(images as u64, "describing");
         let side = |items, name| cache.describe_all(&describer, items, name, global, &bar);
-        let (database, queries) = (side(&dataset.database, "database")?, side(&dataset.queries, "query")?);
+        let (database, queries) = (
+            side(&dataset.database, "database")?,
+            side(&dataset.queries, "query")?,
+        );
         bar.finish_and_clear();
         let fresh = database.fresh + queries.fresh;
-        eprintln!("described {fresh} images, {} more were cached or unreadable", images - fresh);
-        Ok(Self { extractor: describer.extractor, cache, database, queries })
+        eprintln!(
+            "described {fresh} images, {} more were cached or unreadable",
+            images - fresh
+        );
+        Ok(Self {
+            extractor: describer.extractor,
+            cache,
+            database,
+            queries,
+        })
     }
 
-    /// Answers every query as the service would, and where `own` says so a second time without its own place. Nothing
-    /// is re-ranked without a configuration.
+    /// Answers every query as the service would, and where `own` says so a second time without its
+    /// own place. Nothing is re-ranked without a configuration.
     fn answer(
         &self,
         dataset: &Dataset,
@@ -320,7 +392,9 @@ impl Described {
         let (mut answers, search) = search_all(&self.database, &self.queries, wanted);
         if let Some(own) = own {
             eprintln!("each query is also asked with its own place left out of the database");
-            answers.iter_mut().for_each(|answer| own.trim(answer, candidates));
+            answers
+                .iter_mut()
+                .for_each(|answer| own.trim(answer, candidates));
         }
         let (answers, seconds) = match config {
             None => (answers, QuerySeconds::default()),
@@ -331,27 +405,60 @@ impl Described {
             None => (answers, Vec::new()),
             Some(own) => own.part_all(dataset, &answers, candidates),
         };
-        Ok(Answered { answers, left_out, seconds })
+        Ok(Answered {
+            answers,
+            left_out,
+            seconds,
+        })
     }
 
-    fn rerank(&self, answers: Vec<Answer>, config: &RerankConfig) -> anyhow::Result<(Vec<Answer>, QuerySeconds)> {
+    fn rerank(
+        &self,
+        answers: Vec<Answer>,
+        config: &RerankConfig,
+    ) -> anyhow::Result<(Vec<Answer>, QuerySeconds)> {
         let bar = bar(answers.len() as u64, "re-ranking");
         let patches = |features: &Features, index| self.cache.patches(features, index);
-        let reranked = rerank_all(&patches, &self.database, &self.queries, answers, config, &bar)?;
+        let reranked = rerank_all(
+            &patches,
+            &self.database,
+            &self.queries,
+            answers,
+            config,
+            &bar,
+        )?;
         bar.finish_and_clear();
         Ok(reranked)
     }
 }
 
-fn measure(args: &MeasureArgs, dataset: &Dataset, extract: &ExtractConfig) -> anyhow::Result<Measured> {
-    let given = args.method.calibration.as_deref().map(read_calibration).transpose()?;
+fn measure(
+    args: &MeasureArgs,
+    dataset: &Dataset,
+    extract: &ExtractConfig,
+) -> anyhow::Result<Measured> {
+    let given = args
+        .method
+        .calibration
+        .as_deref()
+        .map(read_calibration)
+        .transpose()?;
     let described = Described::new(extract, &args.output.cache, dataset, args.method.global)?;
     let candidates = args.method.rerank.candidates;
     let rerank = (!args.method.no_rerank).then(|| args.method.rerank.config());
     if let Some(given) = &given {
-        check_calibration(given, args.method.global, described.extractor.model_id(), rerank.as_ref())?;
+        check_calibration(
+            given,
+            args.method.global,
+            described.extractor.model_id(),
+            rerank.as_ref(),
+        )?;
     }
-    let own = args.method.leave_out.then(|| OwnPlaces::of(dataset, LeaveOut::Always, args.data.radius)).flatten();
+    let own = args
+        .method
+        .leave_out
+        .then(|| OwnPlaces::of(dataset, LeaveOut::Always, args.data.radius))
+        .flatten();
     let answered = described.answer(dataset, own.as_ref(), candidates, rerank.as_ref())?;
     let config = RunConfig {
         model: described.extractor.model_id().clone(),
@@ -362,10 +469,23 @@ fn measure(args: &MeasureArgs, dataset: &Dataset, extract: &ExtractConfig) -> an
         bootstrap: args.method.bootstrap,
         seed: args.method.seed,
     };
-    let Described { extractor, database, queries, .. } = described;
-    let asked = Asked { answers: &answered.answers, left_out: &answered.left_out, seconds: answered.seconds };
+    let Described {
+        extractor,
+        database,
+        queries,
+        ..
+    } = described;
+    let asked = Asked {
+        answers: &answered.answers,
+        left_out: &answered.left_out,
+        seconds: answered.seconds,
+    };
     let summary = summarise(dataset, &database, &queries, asked, config, given.as_ref())?;
-    Ok(Measured { extractor, answered, summary })
+    Ok(Measured {
+        extractor,
+        answered,
+        summary,
+    })
 }
 
 fn read_calibration(path: &Path) -> anyhow::Result<Calibration> {
@@ -380,16 +500,32 @@ fn check_calibration(
     model: &ModelId,
     rerank: Option<&RerankConfig>,
 ) -> anyhow::Result<()> {
-    ensure!(global == GlobalKind::Head, "a calibration holds for distances of the head: leave --global out");
-    ensure!(given.model() == model, "the calibration is one of {}, and this model is {model}", given.model());
+    ensure!(
+        global == GlobalKind::Head,
+        "a calibration holds for distances of the head: leave --global out"
+    );
+    ensure!(
+        given.model() == model,
+        "the calibration is one of {}, and this model is {model}",
+        given.model()
+    );
     if let Some(rerank) = rerank {
         let id = rerank.id();
-        ensure!(given.rerank() == &id, "the calibration is one of re-ranking {}, and this is {id}", given.rerank());
+        ensure!(
+            given.rerank() == &id,
+            "the calibration is one of re-ranking {}, and this is {id}",
+            given.rerank()
+        );
     }
     Ok(())
 }
 
-fn write_predictions(path: &Path, args: &MeasureArgs, dataset: &Dataset, answers: &[Answer]) -> anyhow::Result<()> {
+fn write_predictions(
+    path: &Path,
+    args: &MeasureArgs,
+    dataset: &Dataset,
+    answers: &[Answer],
+) -> anyhow::Result<()> {
     match args.data.dataset {
         Some(DatasetKind::MslsTest | DatasetKind::MslsVal) => {
             let unanswered = prediction::write_msls(path, dataset, answers)?;
@@ -407,10 +543,19 @@ fn write_predictions(path: &Path, args: &MeasureArgs, dataset: &Dataset, answers
     Ok(())
 }
 
-fn run_ablation(args: &MeasureArgs, dataset: &Dataset, extract: &ExtractConfig) -> anyhow::Result<Ablation> {
+fn run_ablation(
+    args: &MeasureArgs,
+    dataset: &Dataset,
+    extract: &ExtractConfig,
+) -> anyhow::Result<Ablation> {
     let rerank = args.method.rerank.config();
     let mut backbones = vec![extract.preset];
-    backbones.extend(args.method.backbones.iter().filter(|&&preset| preset != extract.preset));
+    backbones.extend(
+        args.method
+            .backbones
+            .iter()
+            .filter(|&&preset| preset != extract.preset),
+    );
     let base = Base {
         extract,
         rerank: &rerank,
@@ -420,7 +565,8 @@ fn run_ablation(args: &MeasureArgs, dataset: &Dataset, extract: &ExtractConfig) 
         memory_bytes: args.output.cache.patch_memory << 20,
     };
     let open = |config: &ExtractConfig| -> Result<Box<dyn Describe>, EvalError> {
-        let describer = describer(config).map_err(|error| EvalError::Setting(format!("{error:#}")))?;
+        let describer =
+            describer(config).map_err(|error| EvalError::Setting(format!("{error:#}")))?;
         Ok(Box::new(describer))
     };
     Ok(ablate(dataset, &base, &open, &MultiProgress::new())?)
@@ -429,5 +575,7 @@ fn run_ablation(args: &MeasureArgs, dataset: &Dataset, extract: &ExtractConfig) 
 fn bar(length: u64, message: &'static str) -> ProgressBar {
     let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} {eta}")
         .unwrap_or_else(|_| ProgressStyle::default_bar());
-    ProgressBar::new(length).with_style(style).with_message(message)
+    ProgressBar::new(length)
+        .with_style(style)
+        .with_message(message)
 }

@@ -1,4 +1,5 @@
-//! Through a running server: raw image bodies, patient with a busy server, never with a wrong request.
+//! Through a running server: raw image bodies, patient with a busy server, never with a wrong
+//! request.
 
 use super::sink::{Outcome, Sent, Sink, UNREACHABLE, Upload};
 use crate::types::MapName;
@@ -67,7 +68,11 @@ impl HttpSink {
                 Attempt::Again { after, .. } if attempt < self.settings.attempts => {
                     // Jitter keeps many clients from coming back at once.
                     let own = wait.mul_f64(rand::rng().random_range(0.5..1.5));
-                    std::thread::sleep(after.unwrap_or(own).clamp(own.min(LONGEST_WAIT), LONGEST_WAIT));
+                    std::thread::sleep(
+                        after
+                            .unwrap_or(own)
+                            .clamp(own.min(LONGEST_WAIT), LONGEST_WAIT),
+                    );
                     wait = (wait * 2).min(LONGEST_WAIT);
                 }
                 outcome => return (outcome, attempt),
@@ -84,7 +89,11 @@ impl HttpSink {
             Ok(response) => judge(response),
             Err(error) => {
                 let detail = format!("{:#}", anyhow::Error::new(error));
-                Attempt::Again { code: UNREACHABLE.into(), detail, after: None }
+                Attempt::Again {
+                    code: UNREACHABLE.into(),
+                    detail,
+                    after: None,
+                }
             }
         }
     }
@@ -92,11 +101,20 @@ impl HttpSink {
 
 fn judge(response: Response) -> Attempt {
     let status = response.status();
-    let after = response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.trim().parse().ok());
+    let after = response
+        .headers()
+        .get(RETRY_AFTER)
+        .and_then(|value| value.to_str().ok()?.trim().parse().ok());
     let after = after.map(Duration::from_secs);
     let body = match response.text() {
         Ok(body) => body,
-        Err(error) => return Attempt::Again { code: UNREACHABLE.into(), detail: error.to_string(), after },
+        Err(error) => {
+            return Attempt::Again {
+                code: UNREACHABLE.into(),
+                detail: error.to_string(),
+                after,
+            };
+        }
     };
     let value: Value = serde_json::from_str(&body).unwrap_or_default();
     if status.is_success() {
@@ -104,10 +122,23 @@ fn judge(response: Response) -> Attempt {
     }
     let text = |key: &str| value[key].as_str().map(str::to_owned);
     let code = text("code").unwrap_or_else(|| format!("http_{}", status.as_u16()));
-    let detail = text("detail").or_else(|| text("title")).unwrap_or_else(|| format!("the server answered {status}"));
-    // A server that is busy or restarting; a proxy in front of it says so without our error document.
-    let passing = value["retryable"].as_bool().unwrap_or(matches!(status.as_u16(), 408 | 429 | 500 | 502 | 503 | 504));
-    if passing { Attempt::Again { code, detail, after } } else { Attempt::Refused { code, detail } }
+    let detail = text("detail")
+        .or_else(|| text("title"))
+        .unwrap_or_else(|| format!("the server answered {status}"));
+    // A server that is busy or restarting; a proxy in front of it says so without our error
+    // document.
+    let passing = value["retryable"]
+        .as_bool()
+        .unwrap_or(matches!(status.as_u16(), 408 | 429 | 500 | 502 | 503 | 504));
+    if passing {
+        Attempt::Again {
+            code,
+            detail,
+            after,
+        }
+    } else {
+        Attempt::Refused { code, detail }
+    }
 }
 
 impl Sink for HttpSink {
@@ -116,22 +147,31 @@ impl Sink for HttpSink {
         let mut cursor: Option<String> = None;
         loop {
             let page = || {
-                let request = self.client.get(self.url("/references")).query(&[("map", map.as_str()), ("limit", PAGE)]);
+                let request = self
+                    .client
+                    .get(self.url("/references"))
+                    .query(&[("map", map.as_str()), ("limit", PAGE)]);
                 request.query(&cursor.as_ref().map(|cursor| [("cursor", cursor)]))
             };
             let value = match self.patiently(page).0 {
                 Attempt::Answered(value, _) => value,
-                Attempt::Refused { code, .. } if code == crate::error::ErrorCode::MapNotFound.as_str() => break,
+                Attempt::Refused { code, .. }
+                    if code == crate::error::ErrorCode::MapNotFound.as_str() =>
+                {
+                    break;
+                }
                 Attempt::Refused { code, detail } | Attempt::Again { code, detail, .. } => {
                     bail!("{}: {detail} ({code})", self.settings.url)
                 }
             };
-            let references =
-                value["references"].as_array().context("the server's answer is not a page of references")?;
+            let references = value["references"]
+                .as_array()
+                .context("the server's answer is not a page of references")?;
             for reference in references {
-                if let (Some(id), Some(hash)) =
-                    (reference["external_id"].as_str(), reference["content_sha256"].as_str())
-                {
+                if let (Some(id), Some(hash)) = (
+                    reference["external_id"].as_str(),
+                    reference["content_sha256"].as_str(),
+                ) {
                     present.insert(id.to_owned(), hash.to_owned());
                 }
             }
@@ -148,7 +188,9 @@ impl Sink for HttpSink {
         let request = || {
             let request = self.client.post(self.url("/references")).query(&parameters);
             // The server looks at the bytes themselves. Cloning shares them.
-            request.header("content-type", "application/octet-stream").body(upload.image.clone())
+            request
+                .header("content-type", "application/octet-stream")
+                .body(upload.image.clone())
         };
         let (attempt, attempts) = self.patiently(request);
         let outcome = match attempt {
@@ -171,12 +213,26 @@ impl Sink for HttpSink {
 fn parameters(upload: &Upload) -> Vec<(&'static str, String)> {
     let fields = &upload.fields;
     let mut parameters = vec![("map", upload.map.to_string())];
-    parameters.extend(fields.external_id.iter().map(|id| ("external_id", id.to_string())));
+    parameters.extend(
+        fields
+            .external_id
+            .iter()
+            .map(|id| ("external_id", id.to_string())),
+    );
     if let Some(location) = fields.location {
-        parameters.extend([("lat", location.lat().to_string()), ("lon", location.lon().to_string())]);
+        parameters.extend([
+            ("lat", location.lat().to_string()),
+            ("lon", location.lon().to_string()),
+        ]);
     }
-    parameters.extend(fields.heading.map(|heading| ("heading", heading.degrees().to_string())));
-    let captured_at = fields.captured_at.and_then(|time| time.format(&Rfc3339).ok());
+    parameters.extend(
+        fields
+            .heading
+            .map(|heading| ("heading", heading.degrees().to_string())),
+    );
+    let captured_at = fields
+        .captured_at
+        .and_then(|time| time.format(&Rfc3339).ok());
     parameters.extend(captured_at.map(|time| ("captured_at", time)));
     parameters
 }
@@ -189,7 +245,8 @@ mod tests {
     use std::net::TcpListener;
     use std::sync::mpsc;
 
-    /// Answers one connection after the other with the given responses and passes on the request lines.
+    /// Answers one connection after the other with the given responses and passes on the request
+    /// lines.
     fn server(answers: Vec<&'static str>) -> (String, mpsc::Receiver<String>) {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let url = format!("http://{}/", listener.local_addr().unwrap());
@@ -212,12 +269,19 @@ mod tests {
                         break;
                     }
                 }
-                reader.take(length as u64).read_to_end(&mut Vec::new()).unwrap();
+                reader
+                    .take(length as u64)
+                    .read_to_end(&mut Vec::new())
+                    .unwrap();
                 let _ = sender.send(request);
                 let (head, body) = answer.split_once('|').unwrap();
                 let mut stream = stream;
-                write!(stream, "HTTP/1.1 {head}\r\ncontent-length: {}\r\nconnection: close\r\n\r\n{body}", body.len())
-                    .unwrap();
+                write!(
+                    stream,
+                    "HTTP/1.1 {head}\r\ncontent-length: {}\r\nconnection: close\r\n\r\n{body}",
+                    body.len()
+                )
+                .unwrap();
             }
         });
         (url, receiver)
@@ -225,7 +289,13 @@ mod tests {
 
     fn sink(url: String, attempts: u32) -> HttpSink {
         let _ = rustls::crypto::ring::default_provider().install_default();
-        HttpSink::new(Settings { url, api_key: None, timeout: Duration::from_secs(10), attempts }).unwrap()
+        HttpSink::new(Settings {
+            url,
+            api_key: None,
+            timeout: Duration::from_secs(10),
+            attempts,
+        })
+        .unwrap()
     }
 
     fn upload() -> Upload {
@@ -234,7 +304,11 @@ mod tests {
             location: Some(GeoPoint::new(1.5, -2.25).unwrap()),
             ..Default::default()
         };
-        Upload { map: "m".parse().unwrap(), fields, image: bytes::Bytes::from_static(b"image") }
+        Upload {
+            map: "m".parse().unwrap(),
+            fields,
+            image: bytes::Bytes::from_static(b"image"),
+        }
     }
 
     #[test]
@@ -245,21 +319,47 @@ mod tests {
             "201 Created|{\"id\":\"r1\"}",
         ]);
         let sent = sink(url, 5).send(upload());
-        assert_eq!(sent, Sent { outcome: Outcome::Created("r1".into()), attempts: 3 });
+        assert_eq!(
+            sent,
+            Sent {
+                outcome: Outcome::Created("r1".into()),
+                attempts: 3
+            }
+        );
         let request = requests.recv().unwrap();
-        assert!(request.starts_with("POST /references?map=m&external_id=a+b%26c.jpg&lat=1.5&lon=-2.25 "), "{request}");
+        assert!(
+            request
+                .starts_with("POST /references?map=m&external_id=a+b%26c.jpg&lat=1.5&lon=-2.25 "),
+            "{request}"
+        );
     }
 
     #[test]
     fn a_wrong_image_is_not_sent_twice_and_patience_ends() {
-        let (url, _) =
-            server(vec!["422 No|{\"code\":\"image_undecodable\",\"detail\":\"truncated\",\"retryable\":false}"]);
+        let (url, _) = server(vec![
+            "422 No|{\"code\":\"image_undecodable\",\"detail\":\"truncated\",\"retryable\":false}",
+        ]);
         let sent = sink(url, 5).send(upload());
-        let refused = |code: &str, detail: &str| Outcome::Refused { code: code.into(), detail: detail.into() };
-        assert_eq!(sent, Sent { outcome: refused("image_undecodable", "truncated"), attempts: 1 });
+        let refused = |code: &str, detail: &str| Outcome::Refused {
+            code: code.into(),
+            detail: detail.into(),
+        };
+        assert_eq!(
+            sent,
+            Sent {
+                outcome: refused("image_undecodable", "truncated"),
+                attempts: 1
+            }
+        );
         let (url, _) = server(vec!["502 Bad|<html>", "502 Bad|<html>"]);
         let sent = sink(url, 2).send(upload());
-        assert_eq!(sent, Sent { outcome: refused("http_502", "the server answered 502 Bad Gateway"), attempts: 2 });
+        assert_eq!(
+            sent,
+            Sent {
+                outcome: refused("http_502", "the server answered 502 Bad Gateway"),
+                attempts: 2
+            }
+        );
     }
 
     #[test]
@@ -271,7 +371,10 @@ mod tests {
         ]);
         let sink = sink(url, 2);
         let present = sink.present(&"m".parse().unwrap()).unwrap();
-        assert_eq!((present.len(), present["a"].as_str(), present["b"].as_str()), (2, "1", "2"));
+        assert_eq!(
+            (present.len(), present["a"].as_str(), present["b"].as_str()),
+            (2, "1", "2")
+        );
         assert!(requests.iter().nth(1).unwrap().contains("cursor=n1"));
         assert!(sink.present(&"m".parse().unwrap()).unwrap().is_empty());
     }

@@ -1,4 +1,5 @@
-//! Where, whither and when a photo was taken: from the positions file, else from its name, else from its EXIF.
+//! Where, whither and when a photo was taken: from the positions file, else from its name, else
+//! from its EXIF.
 //!
 //! Each field is taken from the first source that has it.
 
@@ -36,52 +37,88 @@ impl Row {
 }
 
 impl Metadata {
-    /// Reads the positions file, if there is one. Its rows name photos of `folder` from there, or from where the file
-    /// itself lies.
+    /// Reads the positions file, if there is one. Its rows name photos of `folder` from there, or
+    /// from where the file itself lies.
     pub(super) fn read(
         positions: Option<&Path>,
         folder: &Path,
         zone: Option<UtmZone>,
         require_position: bool,
     ) -> anyhow::Result<Self> {
-        let read = |path: &Path| read_positions(path).with_context(|| format!("cannot use {}", path.display()));
+        let read = |path: &Path| {
+            read_positions(path).with_context(|| format!("cannot use {}", path.display()))
+        };
         let mut rows = positions.map(read).transpose()?.unwrap_or_default();
         if let Some(prefix) = positions.and_then(|path| way_down(path, folder)) {
-            rows =
-                rows.into_iter().map(|(file, row)| (file.strip_prefix(&prefix).unwrap_or(&file).into(), row)).collect();
+            rows = rows
+                .into_iter()
+                .map(|(file, row)| (file.strip_prefix(&prefix).unwrap_or(&file).into(), row))
+                .collect();
         }
-        Ok(Self { rows, zone, require_position })
+        Ok(Self {
+            rows,
+            zone,
+            require_position,
+        })
     }
 
     /// Rows that name none of the images, sorted.
     pub(super) fn without_image<'a>(&self, images: impl Iterator<Item = &'a str>) -> Vec<&str> {
         let images: HashSet<&str> = images.collect();
-        let mut names: Vec<&str> = self.rows.keys().map(String::as_str).filter(|name| !images.contains(name)).collect();
+        let mut names: Vec<&str> = self
+            .rows
+            .keys()
+            .map(String::as_str)
+            .filter(|name| !images.contains(name))
+            .collect();
         names.sort_unstable();
         names
     }
 
     /// The fields of one photo; the error says that a position was required and none was found.
-    pub(super) fn fields(&self, name: &str, external_id: ExternalId, image: &[u8]) -> Result<ReferenceFields, String> {
+    pub(super) fn fields(
+        &self,
+        name: &str,
+        external_id: ExternalId,
+        image: &[u8],
+    ) -> Result<ReferenceFields, String> {
         let exif = read_exif(image);
-        let exif = Row { location: exif.location, heading: exif.heading, captured_at: exif.captured_at };
+        let exif = Row {
+            location: exif.location,
+            heading: exif.heading,
+            captured_at: exif.captured_at,
+        };
         let named = UtmName::parse(name).map(|parsed| Row {
             location: parsed.location(self.zone),
             heading: parsed.heading,
             captured_at: parsed.captured_at,
         });
         let listed = self.rows.get(name).copied().unwrap_or_default();
-        let Row { location, heading, captured_at } = listed.or(named.unwrap_or_default()).or(exif);
+        let Row {
+            location,
+            heading,
+            captured_at,
+        } = listed.or(named.unwrap_or_default()).or(exif);
         if self.require_position && location.is_none() {
             return Err("no position in the positions file, the name or the EXIF".into());
         }
-        Ok(ReferenceFields { external_id: Some(external_id), location, heading, captured_at, metadata: None })
+        Ok(ReferenceFields {
+            external_id: Some(external_id),
+            location,
+            heading,
+            captured_at,
+            metadata: None,
+        })
     }
 }
 
-/// From the folder of `file` down to `folder`, with a slash at the end; `None` if it does not lie below.
+/// From the folder of `file` down to `folder`, with a slash at the end; `None` if it does not lie
+/// below.
 fn way_down(file: &Path, folder: &Path) -> Option<String> {
-    let (from, to) = (file.parent()?.canonicalize().ok()?, folder.canonicalize().ok()?);
+    let (from, to) = (
+        file.parent()?.canonicalize().ok()?,
+        folder.canonicalize().ok()?,
+    );
     let way = to.strip_prefix(from).ok()?.to_str()?.replace('\\', "/");
     (!way.is_empty()).then(|| way + "/")
 }
@@ -89,24 +126,37 @@ fn way_down(file: &Path, folder: &Path) -> Option<String> {
 fn read_positions(path: &Path) -> anyhow::Result<HashMap<String, Row>> {
     let bytes = std::fs::read(path)?;
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
-    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(bytes);
+    let mut reader = csv::ReaderBuilder::new()
+        .trim(csv::Trim::All)
+        .from_reader(bytes);
     let headers = reader.headers()?.clone();
     let known = ["file", "lat", "lon", "heading", "captured_at"];
     if let Some(unknown) = headers.iter().find(|header| !known.contains(header)) {
         bail!("column {unknown:?} is not one of {}", known.join(", "));
     }
-    ensure!(headers.iter().any(|header| header == "file"), "there is no column \"file\"");
+    ensure!(
+        headers.iter().any(|header| header == "file"),
+        "there is no column \"file\""
+    );
     let mut rows = HashMap::new();
     for record in reader.records() {
         let record = record?;
         let line = record.position().map_or(0, csv::Position::line);
         let field = |name: &str| {
-            let text = headers.iter().position(|header| header == name).and_then(|column| record.get(column));
+            let text = headers
+                .iter()
+                .position(|header| header == name)
+                .and_then(|column| record.get(column));
             text.filter(|text| !text.is_empty())
         };
-        let file = field("file").ok_or_else(|| anyhow!("line {line}: file is empty"))?.replace('\\', "/");
+        let file = field("file")
+            .ok_or_else(|| anyhow!("line {line}: file is empty"))?
+            .replace('\\', "/");
         let row = parse_row(&field).with_context(|| format!("line {line}"))?;
-        ensure!(rows.insert(file.clone(), row).is_none(), "line {line}: {file:?} has a row already");
+        ensure!(
+            rows.insert(file.clone(), row).is_none(),
+            "line {line}: {file:?} has a row already"
+        );
     }
     Ok(rows)
 }
@@ -114,7 +164,10 @@ fn read_positions(path: &Path) -> anyhow::Result<HashMap<String, Row>> {
 fn parse_row<'a>(field: &impl Fn(&str) -> Option<&'a str>) -> anyhow::Result<Row> {
     let number = |name: &str| match field(name) {
         None => Ok(None),
-        Some(text) => text.parse::<f64>().map(Some).map_err(|_| anyhow!("{name} {text:?} is not a number")),
+        Some(text) => text
+            .parse::<f64>()
+            .map(Some)
+            .map_err(|_| anyhow!("{name} {text:?} is not a number")),
     };
     let location = match (number("lat")?, number("lon")?) {
         (Some(lat), Some(lon)) => Some(GeoPoint::new(lat, lon)?),
@@ -122,7 +175,8 @@ fn parse_row<'a>(field: &impl Fn(&str) -> Option<&'a str>) -> anyhow::Result<Row
         _ => bail!("lat and lon must be given both or not at all"),
     };
     let parse_time = |text: &str| {
-        OffsetDateTime::parse(text, &Rfc3339).with_context(|| format!("captured_at {text:?} is not an RFC 3339 time"))
+        OffsetDateTime::parse(text, &Rfc3339)
+            .with_context(|| format!("captured_at {text:?} is not an RFC 3339 time"))
     };
     Ok(Row {
         location,
@@ -139,7 +193,12 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("positions.csv");
         std::fs::write(&path, csv).unwrap();
-        Metadata::read(Some(&path), folder.path(), Some("33T".parse().unwrap()), true)
+        Metadata::read(
+            Some(&path),
+            folder.path(),
+            Some("33T".parse().unwrap()),
+            true,
+        )
     }
 
     fn id() -> ExternalId {
@@ -150,12 +209,26 @@ mod tests {
     fn rows_may_be_named_from_where_the_file_lies() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("positions.csv");
-        std::fs::write(&path, "file,lat,lon\ndatabase/a.jpg,1,2\nb.jpg,3,4\nqueries/c.jpg,5,6\n").unwrap();
+        std::fs::write(
+            &path,
+            "file,lat,lon\ndatabase/a.jpg,1,2\nb.jpg,3,4\nqueries/c.jpg,5,6\n",
+        )
+        .unwrap();
         let database = folder.path().join("database");
         std::fs::create_dir(&database).unwrap();
         let metadata = Metadata::read(Some(&path), &database, None, true).unwrap();
-        assert_eq!(metadata.without_image(["a.jpg", "b.jpg"].into_iter()), ["queries/c.jpg"]);
-        let lat = |name: &str| metadata.fields(name, id(), b"").unwrap().location.unwrap().lat();
+        assert_eq!(
+            metadata.without_image(["a.jpg", "b.jpg"].into_iter()),
+            ["queries/c.jpg"]
+        );
+        let lat = |name: &str| {
+            metadata
+                .fields(name, id(), b"")
+                .unwrap()
+                .location
+                .unwrap()
+                .lat()
+        };
         assert_eq!((lat("a.jpg"), lat("b.jpg")), (1.0, 3.0));
     }
 
@@ -169,8 +242,17 @@ mod tests {
         assert_eq!(fields.heading.unwrap().degrees(), 270.0);
         assert_eq!(fields.captured_at.unwrap().unix_timestamp(), 1_779_010_200);
         // The position comes from the name and the zone given, the heading from the row.
-        let fields = metadata.fields("@500000@5000000@@@@@@@123@.jpg", id(), b"").unwrap();
-        assert!(fields.location.unwrap().distance_m(GeoPoint::new(45.153, 15.0).unwrap()) < 100.0, "{fields:?}");
+        let fields = metadata
+            .fields("@500000@5000000@@@@@@@123@.jpg", id(), b"")
+            .unwrap();
+        assert!(
+            fields
+                .location
+                .unwrap()
+                .distance_m(GeoPoint::new(45.153, 15.0).unwrap())
+                < 100.0,
+            "{fields:?}"
+        );
         assert_eq!(fields.heading.unwrap().degrees(), 10.0);
         assert!(metadata.fields("unknown.jpg", id(), b"").is_err());
         assert_eq!(metadata.without_image(["a/b.jpg"].into_iter()).len(), 1);

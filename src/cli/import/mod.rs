@@ -1,9 +1,9 @@
 //! Import a folder of photos into a map.
 //!
-//! Through a running server or straight into a store: both are a [`Sink`]. Each photo's external id is its path
-//! below the folder. What the map holds already, with the same content, is skipped, so an interrupted import is
-//! resumed by running it again. Every photo gets a verdict: a line of the JSONL report, a place in the summary; the
-//! exit code tells whether all are in.
+//! Through a running server or straight into a store: both are a [`Sink`]. Each photo's external id
+//! is its path below the folder. What the map holds already, with the same content, is skipped, so
+//! an interrupted import is resumed by running it again. Every photo gets a verdict: a line of the
+//! JSONL report, a place in the summary; the exit code tells whether all are in.
 
 mod http_sink;
 mod metadata;
@@ -41,10 +41,20 @@ pub struct ImportArgs {
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
     /// Settings for --data, as the server reads them (TOML).
-    #[arg(long, env = "PLACEFORMER_CONFIG", value_name = "FILE", conflicts_with = "server")]
+    #[arg(
+        long,
+        env = "PLACEFORMER_CONFIG",
+        value_name = "FILE",
+        conflicts_with = "server"
+    )]
     config: Option<PathBuf>,
     /// API key, where the server wants one.
-    #[arg(long, env = "PLACEFORMER_API_KEY", hide_env_values = true, value_name = "KEY")]
+    #[arg(
+        long,
+        env = "PLACEFORMER_API_KEY",
+        hide_env_values = true,
+        value_name = "KEY"
+    )]
     api_key: Option<String>,
     /// CSV with the columns file, and any of lat and lon, heading, captured_at (RFC 3339).
     #[arg(long, value_name = "CSV")]
@@ -77,17 +87,37 @@ pub fn run(args: ImportArgs) -> anyhow::Result<()> {
     ensure!(args.concurrency > 0, "--concurrency must be at least 1");
     ensure!(args.attempts > 0, "--attempts must be at least 1");
     let images = list_images(&args.folder)?;
-    ensure!(!images.is_empty(), "{} holds no JPEG, PNG or WebP image", args.folder.display());
-    let metadata = Metadata::read(args.positions.as_deref(), &args.folder, args.utm_zone, args.require_position)?;
+    ensure!(
+        !images.is_empty(),
+        "{} holds no JPEG, PNG or WebP image",
+        args.folder.display()
+    );
+    let metadata = Metadata::read(
+        args.positions.as_deref(),
+        &args.folder,
+        args.utm_zone,
+        args.require_position,
+    )?;
     let unmatched = metadata.without_image(images.iter().map(|(name, _)| name.as_str()));
     if let Some(example) = unmatched.first() {
-        eprintln!("warning: {} rows of the positions file name no image, such as {example:?}", unmatched.len());
+        eprintln!(
+            "warning: {} rows of the positions file name no image, such as {example:?}",
+            unmatched.len()
+        );
     }
     let log = VerdictLog::create(args.report.as_deref())?;
     let sink = open_sink(&args)?;
-    let present = sink.present(&args.map).context("cannot list what the map holds")?;
+    let present = sink
+        .present(&args.map)
+        .context("cannot list what the map holds")?;
     let progress = progress_bar(images.len() as u64);
-    let import = Import { sink: &*sink, metadata: &metadata, map: &args.map, present: &present, log: &log };
+    let import = Import {
+        sink: &*sink,
+        metadata: &metadata,
+        map: &args.map,
+        present: &present,
+        log: &log,
+    };
     let stopped = import.run(&images, args.concurrency, &progress);
     progress.finish_and_clear();
     let summary = log.finish()?;
@@ -95,16 +125,29 @@ pub fn run(args: ImportArgs) -> anyhow::Result<()> {
     if let Some(reason) = stopped {
         bail!("stopped: {reason}");
     }
-    ensure!(summary.failed == 0, "{} of {} photos are not in the map", summary.failed, images.len());
+    ensure!(
+        summary.failed == 0,
+        "{} of {} photos are not in the map",
+        summary.failed,
+        images.len()
+    );
     Ok(())
 }
 
 fn open_sink(args: &ImportArgs) -> anyhow::Result<Box<dyn Sink>> {
     match (&args.server, &args.data) {
         (Some(url), _) => {
-            let ModelOverrides { preset, weights: _, head, precision } = &args.model;
+            let ModelOverrides {
+                preset,
+                weights: _,
+                head,
+                precision,
+            } = &args.model;
             let given = preset.is_some() || head.is_some() || precision.is_some();
-            ensure!(!given, "--preset, --head and --precision go with --data: a server has its own model");
+            ensure!(
+                !given,
+                "--preset, --head and --precision go with --data: a server has its own model"
+            );
             let settings = http_sink::Settings {
                 url: url.clone(),
                 api_key: args.api_key.clone(),
@@ -113,9 +156,11 @@ fn open_sink(args: &ImportArgs) -> anyhow::Result<Box<dyn Sink>> {
             };
             Ok(Box::new(http_sink::HttpSink::new(settings)?))
         }
-        (None, Some(data)) => {
-            Ok(Box::new(store_sink::StoreSink::open(data, args.config.as_deref(), args.model.clone())?))
-        }
+        (None, Some(data)) => Ok(Box::new(store_sink::StoreSink::open(
+            data,
+            args.config.as_deref(),
+            args.model.clone(),
+        )?)),
         (None, None) => bail!("give --server or --data"),
     }
 }
@@ -137,17 +182,30 @@ struct Import<'a> {
 
 impl Import<'_> {
     /// Imports all images from `concurrency` threads; says why if it had to stop before the end.
-    fn run(&self, images: &[(String, PathBuf)], concurrency: usize, progress: &ProgressBar) -> Option<String> {
+    fn run(
+        &self,
+        images: &[(String, PathBuf)],
+        concurrency: usize,
+        progress: &ProgressBar,
+    ) -> Option<String> {
         let (next, stop) = (AtomicUsize::new(0), AtomicBool::new(false));
         let reason = Mutex::new(None);
         std::thread::scope(|scope| {
             for _ in 0..concurrency.min(images.len()) {
                 scope.spawn(|| {
                     while !stop.load(Ordering::Relaxed) {
-                        let Some((name, path)) = images.get(next.fetch_add(1, Ordering::Relaxed)) else { break };
+                        let Some((name, path)) = images.get(next.fetch_add(1, Ordering::Relaxed))
+                        else {
+                            break;
+                        };
                         let (verdict, hopeless) = self.import(name, path);
                         if verdict.status == Status::Failed {
-                            progress.suspend(|| eprintln!("{name}: {}", verdict.detail.as_deref().unwrap_or("failed")));
+                            progress.suspend(|| {
+                                eprintln!(
+                                    "{name}: {}",
+                                    verdict.detail.as_deref().unwrap_or("failed")
+                                )
+                            });
                         }
                         let logged = self.log.add(&verdict);
                         progress.inc(1);
@@ -167,7 +225,9 @@ impl Import<'_> {
                 });
             }
         });
-        reason.into_inner().unwrap_or_else(|poisoned| poisoned.into_inner())
+        reason
+            .into_inner()
+            .unwrap_or_else(|poisoned| poisoned.into_inner())
     }
 
     /// The verdict on one image, and whether going on is hopeless.
@@ -195,13 +255,24 @@ impl Import<'_> {
             Err(detail) => return failed("no_position", detail),
         };
         let located = fields.location.is_some();
-        let sent = self.sink.send(Upload { map: self.map.clone(), fields, image: bytes.into() });
+        let sent = self.sink.send(Upload {
+            map: self.map.clone(),
+            fields,
+            image: bytes.into(),
+        });
         match sent.outcome {
-            Outcome::Created(id) => (Verdict::stored(name, Status::Created, id, located, sent.attempts), false),
-            Outcome::Present(id) => (Verdict::stored(name, Status::Present, id, located, sent.attempts), false),
-            Outcome::Refused { code, detail } => {
-                (Verdict::failed(name, &code, detail, sent.attempts), sink::is_hopeless(&code))
-            }
+            Outcome::Created(id) => (
+                Verdict::stored(name, Status::Created, id, located, sent.attempts),
+                false,
+            ),
+            Outcome::Present(id) => (
+                Verdict::stored(name, Status::Present, id, located, sent.attempts),
+                false,
+            ),
+            Outcome::Refused { code, detail } => (
+                Verdict::failed(name, &code, detail, sent.attempts),
+                sink::is_hopeless(&code),
+            ),
         }
     }
 }
@@ -223,11 +294,23 @@ mod tests {
         fn send(&self, upload: Upload) -> Sent {
             if let Some(code) = upload.image.strip_prefix(b"!") {
                 let code = String::from_utf8_lossy(code).into_owned();
-                return Sent { outcome: Outcome::Refused { code, detail: "refused".into() }, attempts: 1 };
+                return Sent {
+                    outcome: Outcome::Refused {
+                        code,
+                        detail: "refused".into(),
+                    },
+                    attempts: 1,
+                };
             }
             let id = upload.fields.external_id.unwrap().to_string();
-            self.0.lock().unwrap().insert(id, ContentHash::of(&upload.image).to_string());
-            Sent { outcome: Outcome::Created("id".into()), attempts: 1 }
+            self.0
+                .lock()
+                .unwrap()
+                .insert(id, ContentHash::of(&upload.image).to_string());
+            Sent {
+                outcome: Outcome::Created("id".into()),
+                attempts: 1,
+            }
         }
     }
 
@@ -237,7 +320,13 @@ mod tests {
         let map = "m".parse().unwrap();
         let present = sink.present(&map).unwrap();
         let log = VerdictLog::create(Some(report)).unwrap();
-        let import = Import { sink, metadata: &metadata, map: &map, present: &present, log: &log };
+        let import = Import {
+            sink,
+            metadata: &metadata,
+            map: &map,
+            present: &present,
+            log: &log,
+        };
         let stopped = import.run(&images, 3, &ProgressBar::hidden());
         (log.finish().unwrap(), stopped)
     }
@@ -258,22 +347,38 @@ mod tests {
         std::fs::remove_file(photos.join("bad.jpg")).unwrap();
         std::fs::write(photos.join("d.jpg"), "new").unwrap();
         let (summary, _) = import(&photos, &sink, &report);
-        assert_eq!((summary.created, summary.skipped, summary.failed), (1, 2, 1));
-        let lines: Vec<serde_json::Value> =
-            std::fs::read_to_string(&report).unwrap().lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        assert_eq!(
+            (summary.created, summary.skipped, summary.failed),
+            (1, 2, 1)
+        );
+        let lines: Vec<serde_json::Value> = std::fs::read_to_string(&report)
+            .unwrap()
+            .lines()
+            .map(|line| serde_json::from_str(line).unwrap())
+            .collect();
         assert_eq!(lines.len(), 4);
         let changed = lines.iter().find(|line| line["file"] == "b.jpg").unwrap();
-        assert_eq!((&changed["status"], &changed["code"]), (&"failed".into(), &"external_id_conflict".into()));
+        assert_eq!(
+            (&changed["status"], &changed["code"]),
+            (&"failed".into(), &"external_id_conflict".into())
+        );
     }
 
     #[test]
     fn what_holds_for_every_image_stops_the_import() {
         let folder = tempfile::tempdir().unwrap();
         for i in 0..50 {
-            std::fs::write(folder.path().join(format!("{i:02}.jpg")), b"!model_mismatch").unwrap();
+            std::fs::write(
+                folder.path().join(format!("{i:02}.jpg")),
+                b"!model_mismatch",
+            )
+            .unwrap();
         }
         let report = folder.path().join("report.jsonl");
         let (summary, stopped) = import(folder.path(), &Memory::default(), &report);
-        assert!(summary.failed <= 3 && stopped.is_some(), "{summary} {stopped:?}");
+        assert!(
+            summary.failed <= 3 && stopped.is_some(),
+            "{summary} {stopped:?}"
+        );
     }
 }

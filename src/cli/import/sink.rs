@@ -37,7 +37,8 @@ pub(super) struct Sent {
 
 /// Takes photos from several threads at once.
 pub(super) trait Sink: Sync {
-    /// SHA-256 in hexadecimal by external id of all that the map holds; nothing if there is no such map.
+    /// SHA-256 in hexadecimal by external id of all that the map holds; nothing if there is no such
+    /// map.
     fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, String>>;
     /// Stores one photo; tries again itself where that may help.
     fn send(&self, upload: Upload) -> Sent;

@@ -24,9 +24,18 @@ pub(super) struct StoreSink {
 const PAGE: usize = 1000;
 
 impl StoreSink {
-    /// Loads the model and opens the store in `data` with the settings of `config`, `model` above them.
-    pub(super) fn open(data: &Path, config: Option<&Path>, model: ModelOverrides) -> anyhow::Result<Self> {
-        let overrides = Overrides { data: Some(data.to_owned()), model, ..Default::default() };
+    /// Loads the model and opens the store in `data` with the settings of `config`, `model` above
+    /// them.
+    pub(super) fn open(
+        data: &Path,
+        config: Option<&Path>,
+        model: ModelOverrides,
+    ) -> anyhow::Result<Self> {
+        let overrides = Overrides {
+            data: Some(data.to_owned()),
+            model,
+            ..Default::default()
+        };
         let config = Config::load(config, &overrides)?;
         crate::kernels::self_check()?;
         let extractor = Extractor::open(&config.extract).context("cannot load the model")?;
@@ -40,12 +49,19 @@ impl StoreSink {
             metrics: Arc::new(Metrics::new()?),
             health: Arc::new(Health::default()),
         })?;
-        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .enable_all()
+            .build()?;
         Ok(Self { service, runtime })
     }
 
-    fn page(&self, map: &MapName, after: Option<ReferenceId>) -> Result<crate::store::Page, PipelineError> {
-        self.runtime.block_on(self.service.references(Some(map.clone()), after, PAGE))
+    fn page(
+        &self,
+        map: &MapName,
+        after: Option<ReferenceId>,
+    ) -> Result<crate::store::Page, PipelineError> {
+        self.runtime
+            .block_on(self.service.references(Some(map.clone()), after, PAGE))
     }
 }
 
@@ -74,14 +90,21 @@ impl Sink for StoreSink {
 
     fn send(&self, upload: Upload) -> Sent {
         let Upload { map, fields, image } = upload;
-        let outcome = match self.runtime.block_on(self.service.ingest(IngestRequest { map, fields, image })) {
-            Ok(answer) if answer.created => Outcome::Created(answer.reference.id.to_string()),
-            Ok(answer) => Outcome::Present(answer.reference.id.to_string()),
-            Err(error) => Outcome::Refused {
-                code: error.code().as_str().into(),
-                detail: format!("{:#}", anyhow::Error::new(error)),
-            },
-        };
-        Sent { outcome, attempts: 1 }
+        let outcome =
+            match self
+                .runtime
+                .block_on(self.service.ingest(IngestRequest { map, fields, image }))
+            {
+                Ok(answer) if answer.created => Outcome::Created(answer.reference.id.to_string()),
+                Ok(answer) => Outcome::Present(answer.reference.id.to_string()),
+                Err(error) => Outcome::Refused {
+                    code: error.code().as_str().into(),
+                    detail: format!("{:#}", anyhow::Error::new(error)),
+                },
+            };
+        Sent {
+            outcome,
+            attempts: 1,
+        }
     }
 }

@@ -40,19 +40,41 @@ pub(super) struct Verdict {
 
 impl Verdict {
     fn new(file: &str, status: Status, attempts: u32) -> Self {
-        Self { file: file.into(), status, reference: None, located: None, code: None, detail: None, attempts }
+        Self {
+            file: file.into(),
+            status,
+            reference: None,
+            located: None,
+            code: None,
+            detail: None,
+            attempts,
+        }
     }
 
     pub(super) fn skipped(file: &str) -> Self {
         Self::new(file, Status::Skipped, 0)
     }
 
-    pub(super) fn stored(file: &str, status: Status, reference: String, located: bool, attempts: u32) -> Self {
-        Self { reference: Some(reference), located: Some(located), ..Self::new(file, status, attempts) }
+    pub(super) fn stored(
+        file: &str,
+        status: Status,
+        reference: String,
+        located: bool,
+        attempts: u32,
+    ) -> Self {
+        Self {
+            reference: Some(reference),
+            located: Some(located),
+            ..Self::new(file, status, attempts)
+        }
     }
 
     pub(super) fn failed(file: &str, code: &str, detail: String, attempts: u32) -> Self {
-        Self { code: Some(code.into()), detail: Some(detail), ..Self::new(file, Status::Failed, attempts) }
+        Self {
+            code: Some(code.into()),
+            detail: Some(detail),
+            ..Self::new(file, Status::Failed, attempts)
+        }
     }
 }
 
@@ -70,15 +92,24 @@ pub(super) struct Summary {
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let there = self.present + self.skipped;
-        write!(f, "{} created, {there} already there, {} failed", self.created, self.failed)?;
+        write!(
+            f,
+            "{} created, {there} already there, {} failed",
+            self.created, self.failed
+        )?;
         if self.without_position > 0 {
-            write!(f, "; {} of the created have no position", self.without_position)?;
+            write!(
+                f,
+                "; {} of the created have no position",
+                self.without_position
+            )?;
         }
         Ok(())
     }
 }
 
-/// Collects verdicts from all threads; every line is on its way to the disk before the next image begins.
+/// Collects verdicts from all threads; every line is on its way to the disk before the next image
+/// begins.
 pub(super) struct VerdictLog(Mutex<Inner>);
 
 struct Inner {
@@ -89,14 +120,22 @@ struct Inner {
 impl VerdictLog {
     /// Starts a new report; without a path only the summary is kept.
     pub(super) fn create(path: Option<&Path>) -> anyhow::Result<Self> {
-        let create = |path: &Path| File::create(path).with_context(|| format!("cannot write {}", path.display()));
+        let create = |path: &Path| {
+            File::create(path).with_context(|| format!("cannot write {}", path.display()))
+        };
         let file = path.map(create).transpose()?;
-        Ok(Self(Mutex::new(Inner { file, summary: Summary::default() })))
+        Ok(Self(Mutex::new(Inner {
+            file,
+            summary: Summary::default(),
+        })))
     }
 
     /// Adds a verdict.
     pub(super) fn add(&self, verdict: &Verdict) -> std::io::Result<()> {
-        let mut inner = self.0.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let mut inner = self
+            .0
+            .lock()
+            .unwrap_or_else(|poisoned| poisoned.into_inner());
         match verdict.status {
             Status::Created => inner.summary.created += 1,
             Status::Present => inner.summary.present += 1,
@@ -114,7 +153,10 @@ impl VerdictLog {
 
     /// Makes the report durable and returns the counts.
     pub(super) fn finish(self) -> anyhow::Result<Summary> {
-        let inner = self.0.into_inner().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let inner = self
+            .0
+            .into_inner()
+            .unwrap_or_else(|poisoned| poisoned.into_inner());
         if let Some(file) = inner.file {
             file.sync_all().context("cannot write the report")?;
         }

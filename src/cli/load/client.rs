@@ -43,21 +43,36 @@ impl Target {
         images: Vec<Bytes>,
     ) -> anyhow::Result<Self> {
         let base = server.trim_end_matches('/').to_owned();
-        let mut query_url = reqwest::Url::parse(&format!("{base}/query"))
-            .with_context(|| format!("{server:?} is not an address such as http://127.0.0.1:8080"))?;
+        let mut query_url = reqwest::Url::parse(&format!("{base}/query")).with_context(|| {
+            format!("{server:?} is not an address such as http://127.0.0.1:8080")
+        })?;
         query_url.query_pairs_mut().append_pair("map", map);
         let query_url = match options {
             "" => query_url.to_string(),
             more => format!("{query_url}&{more}"),
         };
-        let client = reqwest::Client::builder().timeout(Duration::from_secs(60)).build()?;
-        Ok(Self { client, base, query_url, api_key, images, memory: Mutex::default() })
+        let client = reqwest::Client::builder()
+            .timeout(Duration::from_secs(60))
+            .build()?;
+        Ok(Self {
+            client,
+            base,
+            query_url,
+            api_key,
+            images,
+            memory: Mutex::default(),
+        })
     }
 
     /// Fails early, with the server's own words, when a run would only measure errors.
     pub(super) async fn expect_ready(&self) -> anyhow::Result<()> {
         let url = format!("{}/readyz", self.base);
-        let answer = self.client.get(&url).send().await.with_context(|| format!("cannot reach {url}"))?;
+        let answer = self
+            .client
+            .get(&url)
+            .send()
+            .await
+            .with_context(|| format!("cannot reach {url}"))?;
         let status = answer.status();
         let text = answer.text().await.unwrap_or_default();
         ensure!(status.is_success(), "the server is not ready: {text}");
@@ -68,8 +83,11 @@ impl Target {
     pub(super) async fn query(&self, number: usize) -> Outcome {
         let image = self.images[number % self.images.len()].clone();
         // The server looks at the bytes themselves.
-        let mut request =
-            self.client.post(&self.query_url).header(CONTENT_TYPE, "application/octet-stream").body(image);
+        let mut request = self
+            .client
+            .post(&self.query_url)
+            .header(CONTENT_TYPE, "application/octet-stream")
+            .body(image);
         if let Some(key) = &self.api_key {
             request = request.bearer_auth(key);
         }
@@ -89,12 +107,20 @@ impl Target {
 
     /// Resident bytes of the server, in the order sampled.
     pub(super) fn memory_samples(&self) -> Vec<u64> {
-        self.memory.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.memory
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
     }
 }
 
 fn is_rejection(status: StatusCode) -> bool {
-    matches!(status, StatusCode::TOO_MANY_REQUESTS | StatusCode::SERVICE_UNAVAILABLE | StatusCode::GATEWAY_TIMEOUT)
+    matches!(
+        status,
+        StatusCode::TOO_MANY_REQUESTS
+            | StatusCode::SERVICE_UNAVAILABLE
+            | StatusCode::GATEWAY_TIMEOUT
+    )
 }
 
 /// Samples the server's resident memory from its metrics until aborted.
@@ -105,7 +131,11 @@ pub(super) async fn watch_memory(target: Arc<Target>, every: Duration) {
             && let Ok(text) = answer.text().await
             && let Some(bytes) = resident_bytes(&text)
         {
-            target.memory.lock().unwrap_or_else(PoisonError::into_inner).push(bytes);
+            target
+                .memory
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .push(bytes);
         }
         tokio::time::sleep(every).await;
     }

@@ -62,7 +62,13 @@ pub(super) struct Latency {
 impl From<&Histogram<u64>> for Latency {
     fn from(histogram: &Histogram<u64>) -> Self {
         let at = |quantile| histogram.value_at_quantile(quantile) as f64 / 1e3;
-        Self { p50: at(0.5), p90: at(0.9), p99: at(0.99), p999: at(0.999), max: histogram.max() as f64 / 1e3 }
+        Self {
+            p50: at(0.5),
+            p90: at(0.9),
+            p99: at(0.99),
+            p999: at(0.999),
+            max: histogram.max() as f64 / 1e3,
+        }
     }
 }
 
@@ -91,14 +97,21 @@ pub(super) struct Report {
     pub(super) rejected_ms: Latency,
     /// The server's resident memory: at the start, highest, at the end.
     pub(super) resident_bytes: Option<[u64; 3]>,
-    /// Its highest of the second half less its highest of the first: what a leak would grow, and warming up would not.
+    /// Its highest of the second half less its highest of the first: what a leak would grow, and
+    /// warming up would not.
     pub(super) resident_growth_bytes: Option<i64>,
     /// What the failures said, with their number.
     pub(super) failures: BTreeMap<String, u64>,
 }
 
 impl Report {
-    pub(super) fn new(rate: f64, capacity: Option<f64>, duration: f64, tally: Tally, memory: Vec<u64>) -> Self {
+    pub(super) fn new(
+        rate: f64,
+        capacity: Option<f64>,
+        duration: f64,
+        tally: Tally,
+        memory: Vec<u64>,
+    ) -> Self {
         let resident_bytes = match (memory.first(), memory.iter().max(), memory.last()) {
             (Some(&first), Some(&peak), Some(&last)) => Some([first, peak, last]),
             _ => None,
@@ -117,19 +130,23 @@ impl Report {
             admitted_ms: Latency::from(&tally.admitted),
             rejected_ms: Latency::from(&tally.rejected),
             resident_bytes,
-            resident_growth_bytes: highest(second).zip(highest(first)).map(|(second, first)| second - first),
+            resident_growth_bytes: highest(second)
+                .zip(highest(first))
+                .map(|(second, first)| second - first),
             failures: tally.failures,
         }
     }
 }
 
-/// What a run must keep to. Every rejection must carry Retry-After, and nothing may fail, in any case.
+/// What a run must keep to. Every rejection must carry Retry-After, and nothing may fail, in any
+/// case.
 #[derive(Debug, Default, clap::Args)]
 pub(super) struct Bounds {
     /// Fail if the 99th percentile of answered queries is above this.
     #[arg(long, value_name = "MS")]
     pub(super) max_p99_ms: Option<f64>,
-    /// Fail if the server's highest resident memory of the second half is more above that of the first.
+    /// Fail if the server's highest resident memory of the second half is more above that of the
+    /// first.
     #[arg(long, value_name = "MIB")]
     pub(super) max_growth_mib: Option<f64>,
     /// Fail if fewer queries than this are answered per second.
@@ -142,27 +159,44 @@ impl Bounds {
     pub(super) fn broken_by(&self, report: &Report) -> Vec<String> {
         let mut broken = Vec::new();
         if report.rejected_without_retry_after > 0 {
-            broken.push(format!("{} rejections carried no Retry-After", report.rejected_without_retry_after));
+            broken.push(format!(
+                "{} rejections carried no Retry-After",
+                report.rejected_without_retry_after
+            ));
         }
         if report.failed > 0 {
-            broken.push(format!("{} requests failed with neither an answer nor a rejection", report.failed));
+            broken.push(format!(
+                "{} requests failed with neither an answer nor a rejection",
+                report.failed
+            ));
         }
         if let Some(bound) = self.max_p99_ms
             && report.admitted_ms.p99 > bound
         {
-            broken.push(format!("the 99th percentile is {:.0} ms, above {bound} ms", report.admitted_ms.p99));
+            broken.push(format!(
+                "the 99th percentile is {:.0} ms, above {bound} ms",
+                report.admitted_ms.p99
+            ));
         }
         let rate = report.admitted as f64 / report.duration;
         if let Some(bound) = self.min_admitted_rate
             && rate < bound
         {
-            broken.push(format!("{rate:.2} queries were answered per second, fewer than {bound}"));
+            broken.push(format!(
+                "{rate:.2} queries were answered per second, fewer than {bound}"
+            ));
         }
-        match (self.max_growth_mib, report.resident_growth_bytes.map(mebibytes)) {
+        match (
+            self.max_growth_mib,
+            report.resident_growth_bytes.map(mebibytes),
+        ) {
             (Some(bound), Some(growth)) if growth > bound => {
-                broken.push(format!("the server's memory grew by {growth:.0} MiB, more than {bound} MiB"));
+                broken.push(format!(
+                    "the server's memory grew by {growth:.0} MiB, more than {bound} MiB"
+                ));
             }
-            (Some(_), None) => broken.push("the server's memory could not be read, so its growth is not known".into()),
+            (Some(_), None) => broken
+                .push("the server's memory could not be read, so its growth is not known".into()),
             _ => {}
         }
         broken
@@ -178,12 +212,28 @@ impl fmt::Display for Report {
         if let Some(capacity) = self.capacity {
             writeln!(f, "capacity   {capacity:.2} queries/s (closed loop)")?;
         }
-        writeln!(f, "offered    {:.2} queries/s for {:.0} s", self.rate, self.duration)?;
-        writeln!(f, "admitted   {} ({:.2}/s)", self.admitted, self.admitted as f64 / self.duration)?;
-        writeln!(f, "rejected   {} ({} without Retry-After)", self.rejected, self.rejected_without_retry_after)?;
+        writeln!(
+            f,
+            "offered    {:.2} queries/s for {:.0} s",
+            self.rate, self.duration
+        )?;
+        writeln!(
+            f,
+            "admitted   {} ({:.2}/s)",
+            self.admitted,
+            self.admitted as f64 / self.duration
+        )?;
+        writeln!(
+            f,
+            "rejected   {} ({} without Retry-After)",
+            self.rejected, self.rejected_without_retry_after
+        )?;
         writeln!(f, "failed     {}", self.failed)?;
         writeln!(f, "not sent   {}", self.not_sent)?;
-        for (name, latency) in [("admitted", &self.admitted_ms), ("rejected", &self.rejected_ms)] {
+        for (name, latency) in [
+            ("admitted", &self.admitted_ms),
+            ("rejected", &self.rejected_ms),
+        ] {
             writeln!(
                 f,
                 "{name}   ms: p50 {:.1}  p90 {:.1}  p99 {:.1}  p99.9 {:.1}  max {:.1}",
@@ -201,7 +251,11 @@ impl fmt::Display for Report {
             )?;
         }
         if let Some(growth) = self.resident_growth_bytes {
-            writeln!(f, "growth     {:+.1} MiB from the first half to the second", mebibytes(growth))?;
+            writeln!(
+                f,
+                "growth     {:+.1} MiB from the first half to the second",
+                mebibytes(growth)
+            )?;
         }
         for (reason, count) in &self.failures {
             writeln!(f, "  {count} x {reason}")?;
@@ -219,13 +273,30 @@ mod tests {
         let mut tally = Tally::default();
         tally.add(Duration::from_millis(10), Outcome::Admitted);
         tally.add(Duration::from_millis(30), Outcome::Admitted);
-        tally.add(Duration::from_millis(1), Outcome::Rejected { retry_after: true });
-        tally.add(Duration::from_millis(1), Outcome::Rejected { retry_after: false });
+        tally.add(
+            Duration::from_millis(1),
+            Outcome::Rejected { retry_after: true },
+        );
+        tally.add(
+            Duration::from_millis(1),
+            Outcome::Rejected { retry_after: false },
+        );
         tally.add(Duration::ZERO, Outcome::Failed("500".into()));
         tally.add(Duration::ZERO, Outcome::NotSent);
         let report = Report::new(2.0, None, 3.0, tally, vec![5, 9, 7]);
-        assert_eq!((report.admitted, report.rejected, report.failed, report.not_sent), (2, 2, 1, 1));
-        assert_eq!((report.rejected_without_retry_after, report.resident_bytes), (1, Some([5, 9, 7])));
+        assert_eq!(
+            (
+                report.admitted,
+                report.rejected,
+                report.failed,
+                report.not_sent
+            ),
+            (2, 2, 1, 1)
+        );
+        assert_eq!(
+            (report.rejected_without_retry_after, report.resident_bytes),
+            (1, Some([5, 9, 7]))
+        );
         assert!((report.admitted_ms.max - 30.0).abs() < 0.1);
         assert_eq!(report.resident_growth_bytes, Some(4));
     }
@@ -238,11 +309,32 @@ mod tests {
             Report::new(1.0, None, 1.0, tally, memory)
         };
         let mebi = |count: u64| count << 20;
-        let kept = Bounds { max_p99_ms: Some(110.0), max_growth_mib: Some(8.0), min_admitted_rate: Some(0.9) };
-        assert_eq!(kept.broken_by(&report(vec![mebi(10), mebi(50), mebi(40), mebi(58)])), Vec::<String>::new());
-        let broken = Bounds { max_p99_ms: Some(90.0), max_growth_mib: Some(7.0), min_admitted_rate: Some(1.1) };
-        assert_eq!(broken.broken_by(&report(vec![mebi(10), mebi(50), mebi(40), mebi(58)])).len(), 3);
+        let kept = Bounds {
+            max_p99_ms: Some(110.0),
+            max_growth_mib: Some(8.0),
+            min_admitted_rate: Some(0.9),
+        };
+        assert_eq!(
+            kept.broken_by(&report(vec![mebi(10), mebi(50), mebi(40), mebi(58)])),
+            Vec::<String>::new()
+        );
+        let broken = Bounds {
+            max_p99_ms: Some(90.0),
+            max_growth_mib: Some(7.0),
+            min_admitted_rate: Some(1.1),
+        };
+        assert_eq!(
+            broken
+                .broken_by(&report(vec![mebi(10), mebi(50), mebi(40), mebi(58)]))
+                .len(),
+            3
+        );
         let unknown = broken.broken_by(&report(Vec::new()));
-        assert!(unknown.iter().any(|reason| reason.contains("could not be read")), "{unknown:?}");
+        assert!(
+            unknown
+                .iter()
+                .any(|reason| reason.contains("could not be read")),
+            "{unknown:?}"
+        );
     }
 }

@@ -6,10 +6,16 @@ use crate::cli::output::say;
 use crate::extract::pull::resolve_weights;
 use crate::extract::{Aggregate, ExtractConfig, Extractor, Head, HeadChoice, VitWeights};
 use crate::image::ImageConfig;
-use crate::train::{Augmentation, BackboneModel, Progress, Session, TrainError, TrainableBlocks, TripletSet};
+use crate::train::{
+    Augmentation, BackboneModel, Progress, Session, TrainError, TrainableBlocks, TripletSet,
+};
 use anyhow::ensure;
 
-pub(super) fn train(args: &RunArgs, blocks: TrainableBlocks, augmentation: Augmentation) -> anyhow::Result<()> {
+pub(super) fn train(
+    args: &RunArgs,
+    blocks: TrainableBlocks,
+    augmentation: Augmentation,
+) -> anyhow::Result<()> {
     crate::kernels::self_check()?;
     let config = args.config(augmentation)?;
     let sides = args.data.load(args.method.seed)?;
@@ -34,28 +40,53 @@ pub(super) fn train(args: &RunArgs, blocks: TrainableBlocks, augmentation: Augme
     );
     let bar = bar(&config)?;
     let mut progress = |progress: Progress<'_>| show(&bar, progress);
-    let session = Session { folder: args.out.clone(), identity, progress: &mut progress };
+    let session = Session {
+        folder: args.out.clone(),
+        identity,
+        progress: &mut progress,
+    };
     let outcome = model.train(&sides.training, &sides.validation, &config, session)?;
     bar.finish_and_clear();
-    let (path, head) = (args.out.join("weights.safetensors"), args.out.join("head.safetensors"));
+    let (path, head) = (
+        args.out.join("weights.safetensors"),
+        args.out.join("head.safetensors"),
+    );
     let backbone = || -> Result<String, TrainError> {
-        let config = ExtractConfig { head: HeadChoice::None, ..extract.clone() };
+        let config = ExtractConfig {
+            head: HeadChoice::None,
+            ..extract.clone()
+        };
         Ok(Extractor::load(&config, &path)?.backbone().to_owned())
     };
-    let notes = notes(args, &spec.input_size.to_string(), &sides.description, &outcome);
+    let notes = notes(
+        args,
+        &spec.input_size.to_string(),
+        &sides.description,
+        &outcome,
+    );
     model.save(&path, &head, backbone, notes)?;
     let trained = match blocks {
         TrainableBlocks::Last(count) => format!("the last {count} computed blocks and the head"),
         TrainableBlocks::All => "all computed blocks and the head".to_owned(),
     };
     let began = format!("{} with head {}", start.backbone(), extract.head);
-    finish(&args.out, &facts(args, &trained, &sides.description, &began), &config, &outcome)?;
+    finish(
+        &args.out,
+        &facts(args, &trained, &sides.description, &began),
+        &config,
+        &outcome,
+    )?;
     say!("{}", path.display())?;
     Ok(())
 }
 
-/// The head given, or a PCA of the training images. The encoder that finds it is gone before training needs the room.
-fn starting_head(args: &RunArgs, extract: &ExtractConfig, training: &TripletSet) -> anyhow::Result<Head> {
+/// The head given, or a PCA of the training images. The encoder that finds it is gone before
+/// training needs the room.
+fn starting_head(
+    args: &RunArgs,
+    extract: &ExtractConfig,
+    training: &TripletSet,
+) -> anyhow::Result<Head> {
     let extractor = Extractor::open(extract)?;
     match extractor.head() {
         Some(head) => Ok(head.clone()),

@@ -11,17 +11,22 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Data")]
 pub(super) struct TrainData {
-    /// A data set whose images have positions, in the layout in which it is distributed; repeat with --root. Images of
-    /// different sets are taken to show different places.
-    #[arg(long, value_enum, requires = "root", required_unless_present = "drives")]
+    /// A data set whose images have positions, in the layout in which it is distributed; repeat
+    /// with --root. Images of different sets are taken to show different places.
+    #[arg(
+        long,
+        value_enum,
+        requires = "root",
+        required_unless_present = "drives"
+    )]
     dataset: Vec<DatasetKind>,
     /// Where that data set lies; one for each --dataset, in their order.
     #[arg(long, value_name = "DIR", requires = "dataset")]
     root: Vec<PathBuf>,
     #[command(flatten)]
     reading: ReadArgs,
-    /// Folders of one drive each, whose frames follow each other by name and have no positions: neighbours show the
-    /// same place.
+    /// Folders of one drive each, whose frames follow each other by name and have no positions:
+    /// neighbours show the same place.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     drives: Vec<PathBuf>,
     /// Greatest distance of a positive (paper: 10).
@@ -36,21 +41,28 @@ pub(super) struct TrainData {
     /// Frame distance beyond which an image of the same drive is a negative.
     #[arg(long, default_value_t = 15, value_name = "FRAMES")]
     negative_frames: usize,
-    /// Share of the images held out for validation: whole blocks of ground, and the end of each drive. Images within
-    /// the negative distance of a held-out one are not learnt from.
+    /// Share of the images held out for validation: whole blocks of ground, and the end of each
+    /// drive. Images within the negative distance of a held-out one are not learnt from.
     #[arg(long, default_value_t = 0.2, value_name = "SHARE")]
     validation_share: f64,
     /// Side of a block of ground.
     #[arg(long, default_value_t = 100.0, value_name = "METRES")]
     validation_block: f64,
-    /// A data set to validate on instead of a held-out share [split: val]; repeat with --validation-root.
+    /// A data set to validate on instead of a held-out share [split: val]; repeat with
+    /// --validation-root.
     #[arg(long, value_enum, requires = "validation_root")]
     validation_dataset: Vec<DatasetKind>,
     /// Where that data set lies.
     #[arg(long, value_name = "DIR", requires = "validation_dataset")]
     validation_root: Vec<PathBuf>,
-    /// Only these cities of the validation data set (MSLS) [default: the split's own]; --cities are those learnt from.
-    #[arg(long, value_delimiter = ',', value_name = "CITY,...", requires = "validation_dataset")]
+    /// Only these cities of the validation data set (MSLS) [default: the split's own]; --cities are
+    /// those learnt from.
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "CITY,...",
+        requires = "validation_dataset"
+    )]
     validation_cities: Vec<String>,
     /// Drives to validate on instead of a held-out share.
     #[arg(long, num_args = 1.., value_name = "DIR")]
@@ -75,34 +87,76 @@ impl TrainData {
     /// Reads all sets and splits them by place.
     pub(super) fn load(&self, seed: u64) -> anyhow::Result<Sides> {
         let split = self.reading.split.unwrap_or(Split::Train);
-        let options = DatasetOptions { split: Some(split), ..self.reading.options() };
+        let options = DatasetOptions {
+            split: Some(split),
+            ..self.reading.options()
+        };
         let given = read(&self.dataset, &self.root, &options, &self.drives)?;
         let explicit = !(self.validation_dataset.is_empty() && self.validation_drives.is_empty());
         let (training, validation) = if explicit {
-            // The cities learnt from are never those judged on, so the flag for one side says nothing about the other.
+            // The cities learnt from are never those judged on, so the flag for one side says
+            // nothing about the other.
             let cities = self.validation_cities.clone();
-            let options = DatasetOptions { split: Some(Split::Val), cities, ..self.reading.options() };
-            (given, read(&self.validation_dataset, &self.validation_root, &options, &self.validation_drives)?)
+            let options = DatasetOptions {
+                split: Some(Split::Val),
+                cities,
+                ..self.reading.options()
+            };
+            (
+                given,
+                read(
+                    &self.validation_dataset,
+                    &self.validation_root,
+                    &options,
+                    &self.validation_drives,
+                )?,
+            )
         } else {
             self.hold_out(given, seed)?
         };
         let training = self.triplets(training).context("nothing to learn from")?;
-        let validation = self.triplets(validation).context("nothing to validate on")?;
+        let validation = self
+            .triplets(validation)
+            .context("nothing to validate on")?;
         refuse_shared_images(&training, &validation)?;
-        let of = |set: &TripletSet| format!("{} queries, {} database images", set.queries.len(), set.database.len());
+        let of = |set: &TripletSet| {
+            format!(
+                "{} queries, {} database images",
+                set.queries.len(),
+                set.database.len()
+            )
+        };
         let description = format!("training {}; validation {}", of(&training), of(&validation));
-        Ok(Sides { training, validation, description })
+        Ok(Sides {
+            training,
+            validation,
+            description,
+        })
     }
 
     /// The sets and drives as people would name them in a report.
     pub(super) fn names(&self) -> String {
-        let paths = self.root.iter().chain(&self.drives).chain(&self.validation_root).chain(&self.validation_drives);
-        paths.map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+        let paths = self
+            .root
+            .iter()
+            .chain(&self.drives)
+            .chain(&self.validation_root)
+            .chain(&self.validation_drives);
+        paths
+            .map(|path| path.display().to_string())
+            .collect::<Vec<_>>()
+            .join(", ")
     }
 
     /// Which images count as positives and negatives, for a report.
     pub(super) fn distances(&self) -> String {
-        let Self { positive_m, negative_m, positive_frames, negative_frames, .. } = self;
+        let Self {
+            positive_m,
+            negative_m,
+            positive_frames,
+            negative_frames,
+            ..
+        } = self;
         format!(
             "positives within {positive_m} m or {positive_frames} frames, negatives beyond {negative_m} m or \
              {negative_frames} frames"
@@ -130,10 +184,18 @@ impl TrainData {
     fn triplets(&self, sources: Sources) -> anyhow::Result<TripletSet> {
         let mut sets = Vec::new();
         for dataset in &sources.datasets {
-            sets.push(TripletSet::by_position(dataset, self.positive_m, self.negative_m)?);
+            sets.push(TripletSet::by_position(
+                dataset,
+                self.positive_m,
+                self.negative_m,
+            )?);
         }
         if !sources.drives.is_empty() {
-            sets.push(TripletSet::by_order(&sources.drives, self.positive_frames, self.negative_frames)?);
+            sets.push(TripletSet::by_order(
+                &sources.drives,
+                self.positive_frames,
+                self.negative_frames,
+            )?);
         }
         Ok(TripletSet::merge(sets)?)
     }
@@ -145,17 +207,31 @@ fn read(
     options: &DatasetOptions,
     drives: &[PathBuf],
 ) -> anyhow::Result<Sources> {
-    ensure!(kinds.len() == roots.len(), "{} data sets are named, and {} roots", kinds.len(), roots.len());
+    ensure!(
+        kinds.len() == roots.len(),
+        "{} data sets are named, and {} roots",
+        kinds.len(),
+        roots.len()
+    );
     let mut sources = Sources::default();
     for (&kind, root) in kinds.iter().zip(roots) {
         let dataset = datasets::load(kind, root, options)?;
         if !dataset.database.iter().any(|item| item.position.is_some()) {
-            bail!("{}: no image has a position to tell places apart by", root.display());
+            bail!(
+                "{}: no image has a position to tell places apart by",
+                root.display()
+            );
         }
-        dataset.notes.iter().for_each(|note| eprintln!("{}: {note}", dataset.name));
+        dataset
+            .notes
+            .iter()
+            .for_each(|note| eprintln!("{}: {note}", dataset.name));
         sources.datasets.push(dataset);
     }
-    sources.drives = drives.iter().map(|folder| frames(folder)).collect::<anyhow::Result<_>>()?;
+    sources.drives = drives
+        .iter()
+        .map(|folder| frames(folder))
+        .collect::<anyhow::Result<_>>()?;
     Ok(sources)
 }
 
@@ -163,24 +239,42 @@ fn read(
 fn refuse_shared_images(training: &TripletSet, validation: &TripletSet) -> anyhow::Result<()> {
     let mut folders = HashMap::new();
     let mut files = |set: &TripletSet| -> anyhow::Result<HashSet<PathBuf>> {
-        set.queries.iter().chain(&set.database).map(|path| one_name(path, &mut folders)).collect()
+        set.queries
+            .iter()
+            .chain(&set.database)
+            .map(|path| one_name(path, &mut folders))
+            .collect()
     };
     let learnt = files(training)?;
-    if let Some(shared) = files(validation)?.iter().find(|path| learnt.contains(*path)) {
-        bail!("{} is among the images to learn from and among those to validate on", shared.display());
+    if let Some(shared) = files(validation)?
+        .iter()
+        .find(|path| learnt.contains(*path))
+    {
+        bail!(
+            "{} is among the images to learn from and among those to validate on",
+            shared.display()
+        );
     }
     Ok(())
 }
 
-/// The same path for the same file, by whatever way it was reached. Folders are looked up once: data sets hold millions
-/// of files in few of them.
+/// The same path for the same file, by whatever way it was reached. Folders are looked up once:
+/// data sets hold millions of files in few of them.
 fn one_name(path: &Path, folders: &mut HashMap<PathBuf, PathBuf>) -> anyhow::Result<PathBuf> {
-    let (Some(parent), Some(name)) = (path.parent(), path.file_name()) else { return Ok(path.to_owned()) };
-    let parent = if parent.as_os_str().is_empty() { Path::new(".") } else { parent };
+    let (Some(parent), Some(name)) = (path.parent(), path.file_name()) else {
+        return Ok(path.to_owned());
+    };
+    let parent = if parent.as_os_str().is_empty() {
+        Path::new(".")
+    } else {
+        parent
+    };
     if let Some(real) = folders.get(parent) {
         return Ok(real.join(name));
     }
-    let real = parent.canonicalize().with_context(|| parent.display().to_string())?;
+    let real = parent
+        .canonicalize()
+        .with_context(|| parent.display().to_string())?;
     let file = real.join(name);
     folders.insert(parent.to_owned(), real);
     Ok(file)
@@ -188,7 +282,11 @@ fn one_name(path: &Path, folders: &mut HashMap<PathBuf, PathBuf>) -> anyhow::Res
 
 fn frames(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let images = list_images(folder)?;
-    ensure!(!images.is_empty(), "{} holds no JPEG, PNG or WebP image", folder.display());
+    ensure!(
+        !images.is_empty(),
+        "{} holds no JPEG, PNG or WebP image",
+        folder.display()
+    );
     Ok(images.into_iter().map(|(_, path)| path).collect())
 }
 
@@ -208,15 +306,19 @@ mod tests {
         command.data.load(1)
     }
 
-    /// Cities of three places each, as MSLS is distributed; no city of training has a subtask index.
+    /// Cities of three places each, as MSLS is distributed; no city of training has a subtask
+    /// index.
     fn msls() -> tempfile::TempDir {
         let root = tempfile::tempdir().unwrap();
         for city in ["london", "paris", "cph", "sf"] {
             for side in ["database", "query"] {
                 let folder = root.path().join("train_val").join(city).join(side);
                 std::fs::create_dir_all(folder.join("images")).unwrap();
-                let (mut raw, mut post, mut index) =
-                    (",key,ca,pano\n".to_owned(), ",key,easting,northing\n".to_owned(), ",key,all\n".to_owned());
+                let (mut raw, mut post, mut index) = (
+                    ",key,ca,pano\n".to_owned(),
+                    ",key,easting,northing\n".to_owned(),
+                    ",key,all\n".to_owned(),
+                );
                 for place in 0..3 {
                     let key = format!("{city}-{side}-{place}");
                     std::fs::write(folder.join("images").join(format!("{key}.jpg")), b"x").unwrap();
@@ -235,8 +337,15 @@ mod tests {
     }
 
     fn cities(set: &TripletSet) -> Vec<String> {
-        let city = |path: &PathBuf| path.file_name()?.to_str()?.split('-').next().map(str::to_owned);
-        let cities: std::collections::BTreeSet<String> = set.queries.iter().filter_map(city).collect();
+        let city = |path: &PathBuf| {
+            path.file_name()?
+                .to_str()?
+                .split('-')
+                .next()
+                .map(str::to_owned)
+        };
+        let cities: std::collections::BTreeSet<String> =
+            set.queries.iter().filter_map(city).collect();
         cities.into_iter().collect()
     }
 
@@ -244,15 +353,30 @@ mod tests {
     fn cities_to_learn_from_are_not_those_to_validate_on() {
         let root = msls();
         let root = root.path().to_str().unwrap();
-        let base = ["--dataset", "msls-val", "--root", root, "--cities", "london"];
-        let validation = ["--validation-dataset", "msls-val", "--validation-root", root];
+        let base = [
+            "--dataset",
+            "msls-val",
+            "--root",
+            root,
+            "--cities",
+            "london",
+        ];
+        let validation = [
+            "--validation-dataset",
+            "msls-val",
+            "--validation-root",
+            root,
+        ];
         let with = |more: &[&str]| load(&[&base[..], &validation, more].concat());
         let sides = with(&[]).unwrap();
         assert_eq!(
             (cities(&sides.training), cities(&sides.validation)),
             (vec!["london".into()], vec!["cph".into(), "sf".into()])
         );
-        assert_eq!(cities(&with(&["--validation-cities", "sf"]).unwrap().validation), ["sf"]);
+        assert_eq!(
+            cities(&with(&["--validation-cities", "sf"]).unwrap().validation),
+            ["sf"]
+        );
     }
 
     #[test]
@@ -272,6 +396,9 @@ mod tests {
             detour.to_str().unwrap(),
         ]);
         let error = refused.err().expect("cph is on both sides").to_string();
-        assert!(error.contains("cph-") && error.contains("among those to validate on"), "{error}");
+        assert!(
+            error.contains("cph-") && error.contains("among those to validate on"),
+            "{error}"
+        );
     }
 }

@@ -2,7 +2,9 @@
 
 use super::{HeadTrainArgs, RunArgs, bar, facts, finish, notes, show};
 use crate::extract::{Covariance, Extractor, Head, HeadChoice, half_whitened_head_of_few};
-use crate::train::{Augmentation, HeadModel, PooledCache, PooledTokens, Progress, Session, Side, TripletSet};
+use crate::train::{
+    Augmentation, HeadModel, PooledCache, PooledTokens, Progress, Session, Side, TripletSet,
+};
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::collections::HashSet;
@@ -42,17 +44,33 @@ pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
     .join(" ");
     let bar = bar(&config)?;
     let mut progress = |progress: Progress<'_>| show(&bar, progress);
-    let session = Session { folder: args.out.clone(), identity, progress: &mut progress };
+    let session = Session {
+        folder: args.out.clone(),
+        identity,
+        progress: &mut progress,
+    };
     let outcome = model.train(&sides.training, &sides.validation, &config, session)?;
     bar.finish_and_clear();
     let (weight, bias) = model.weights()?;
-    let notes = notes(args, &extractor.input_size().to_string(), &sides.description, &outcome);
-    start.with_weights(weight, bias, notes)?.save(&args.out.join("head.safetensors"))?;
+    let notes = notes(
+        args,
+        &extractor.input_size().to_string(),
+        &sides.description,
+        &outcome,
+    );
+    start
+        .with_weights(weight, bias, notes)?
+        .save(&args.out.join("head.safetensors"))?;
     let began = match extract.head {
         HeadChoice::None => "a half-whitened PCA of the training images".to_owned(),
         other => format!("head {other} ({})", start.aggregate()),
     };
-    finish(&args.out, &facts(args, "head", &sides.description, &began), &config, &outcome)
+    finish(
+        &args.out,
+        &facts(args, "head", &sides.description, &began),
+        &config,
+        &outcome,
+    )
 }
 
 /// Where pooled tokens come from.
@@ -70,15 +88,25 @@ pub(super) struct Tokens {
 impl<'a> Source<'a> {
     pub(super) fn open(args: &RunArgs, extractor: &'a Extractor) -> anyhow::Result<Self> {
         let folder = args.cache_folder()?;
-        let cache = PooledCache::open(&folder, extractor).with_context(|| folder.display().to_string())?;
+        let cache =
+            PooledCache::open(&folder, extractor).with_context(|| folder.display().to_string())?;
         Ok(Self { extractor, cache })
     }
 
     pub(super) fn tokens(&mut self, set: &TripletSet) -> anyhow::Result<Tokens> {
-        let style = ProgressStyle::with_template("describing images {wide_bar} {pos}/{len} {per_sec} {eta}")?;
-        let bar = ProgressBar::new((set.queries.len() + set.database.len()) as u64).with_style(style);
-        let mut side = |side| self.cache.pool(self.extractor, set.images(side), &|images| bar.inc(images));
-        let tokens = Tokens { queries: side(Side::Query)?, database: side(Side::Database)? };
+        let style = ProgressStyle::with_template(
+            "describing images {wide_bar} {pos}/{len} {per_sec} {eta}",
+        )?;
+        let bar =
+            ProgressBar::new((set.queries.len() + set.database.len()) as u64).with_style(style);
+        let mut side = |side| {
+            self.cache
+                .pool(self.extractor, set.images(side), &|images| bar.inc(images))
+        };
+        let tokens = Tokens {
+            queries: side(Side::Query)?,
+            database: side(Side::Database)?,
+        };
         bar.finish_and_clear();
         Ok(tokens)
     }
@@ -90,19 +118,42 @@ impl Tokens {
     }
 }
 
-/// The head to start from where none is given: what `head fit` would make of the training images, each of which counts
-/// once even if it both asks and answers.
-pub(super) fn fit(extractor: &Extractor, set: &TripletSet, training: &Tokens) -> anyhow::Result<Head> {
+/// The head to start from where none is given: what `head fit` would make of the training images,
+/// each of which counts once even if it both asks and answers.
+pub(super) fn fit(
+    extractor: &Extractor,
+    set: &TripletSet,
+    training: &Tokens,
+) -> anyhow::Result<Head> {
     let (aggregate, backbone) = (extractor.aggregate().clone(), extractor.backbone());
     let dim = aggregate.pooled_dim(extractor.dim());
-    let images = || set.images(Side::Database).iter().chain(set.images(Side::Query));
+    let images = || {
+        set.images(Side::Database)
+            .iter()
+            .chain(set.images(Side::Query))
+    };
     let mut seen = HashSet::new();
     let is_first: Vec<bool> = images().map(|image| seen.insert(image)).collect();
-    let all = || training.database.chunks_exact(dim).chain(training.queries.chunks_exact(dim));
-    let rows = || all().zip(&is_first).filter(|(_, first)| **first).map(|(row, _)| row);
+    let all = || {
+        training
+            .database
+            .chunks_exact(dim)
+            .chain(training.queries.chunks_exact(dim))
+    };
+    let rows = || {
+        all()
+            .zip(&is_first)
+            .filter(|(_, first)| **first)
+            .map(|(row, _)| row)
+    };
     if rows().count() <= dim {
         let rows: Vec<Vec<f32>> = rows().map(<[f32]>::to_vec).collect();
-        return Ok(half_whitened_head_of_few(&rows, aggregate, backbone, Default::default())?);
+        return Ok(half_whitened_head_of_few(
+            &rows,
+            aggregate,
+            backbone,
+            Default::default(),
+        )?);
     }
     let mut covariance = Covariance::new(dim);
     rows().for_each(|row| covariance.add(row));

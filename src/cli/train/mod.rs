@@ -1,7 +1,8 @@
 //! Train the model.
 //!
-//! The head alone is trained on pooled tokens that are computed once; blocks of the backbone are trained on the images
-//! themselves. Both run in a folder that holds all they need to go on after an interruption.
+//! The head alone is trained on pooled tokens that are computed once; blocks of the backbone are
+//! trained on the images themselves. Both run in a folder that holds all they need to go on after
+//! an interruption.
 
 mod backbone;
 mod data;
@@ -9,7 +10,9 @@ mod head;
 
 use super::model_args::ModelOptions;
 use crate::cli::output::say;
-use crate::train::{Augmentation, Outcome, Progress, Schedule, TrainConfig, TrainableBlocks, read_log, report};
+use crate::train::{
+    Augmentation, Outcome, Progress, Schedule, TrainConfig, TrainableBlocks, read_log, report,
+};
 use anyhow::{Context, ensure};
 use clap::Args;
 use data::TrainData;
@@ -20,7 +23,8 @@ use std::str::FromStr;
 
 pub(super) use head::train_head;
 
-const EXAMPLES: &str = "Examples: the paper's order, first MSLS, then Pitts30k from where that ended
+const EXAMPLES: &str =
+    "Examples: the paper's order, first MSLS, then Pitts30k from where that ended
   placeformer train --trainable last-2 --dataset msls-val --root /data/msls --out first \\
       --validation-dataset msls-val --validation-root /data/msls
   placeformer train --trainable last-2 --dataset pitts30k --root /data/pitts30k --out second \\
@@ -31,8 +35,9 @@ const EXAMPLES: &str = "Examples: the paper's order, first MSLS, then Pitts30k f
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub struct TrainArgs {
-    /// What moves: the head alone (minutes on a CPU), the last N computed blocks and the head (last-N), or all.
-    /// Blocks need three images a triplet in memory: lower --batch where that does not fit.
+    /// What moves: the head alone (minutes on a CPU), the last N computed blocks and the head
+    /// (last-N), or all. Blocks need three images a triplet in memory: lower --batch where that
+    /// does not fit.
     #[arg(long, default_value = "head", value_name = "head|last-N|all")]
     trainable: Trainable,
     #[command(flatten)]
@@ -72,7 +77,8 @@ struct MethodArgs {
     /// Steps of the whole run, unless validation stops improving before.
     #[arg(long, default_value_t = 5000, value_name = "N")]
     steps: u64,
-    /// Steps of growing learning rate before the cosine falls [default: 100, at most a tenth of the steps].
+    /// Steps of growing learning rate before the cosine falls [default: 100, at most a tenth of the
+    /// steps].
     #[arg(long, value_name = "N")]
     warm_up: Option<u64>,
     /// Highest learning rate of Adam (paper: 5e-4).
@@ -101,7 +107,8 @@ struct MethodArgs {
     seed: u64,
 }
 
-/// Variation of the images when blocks are trained; pooled tokens of a head's training cannot be varied.
+/// Variation of the images when blocks are trained; pooled tokens of a head's training cannot be
+/// varied.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Augmentation (not with --trainable head)")]
 struct AugmentArgs {
@@ -130,7 +137,12 @@ impl FromStr for Trainable {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let last = |text: &str| text.strip_prefix("last-")?.parse().ok().filter(|&count: &usize| count > 0);
+        let last = |text: &str| {
+            text.strip_prefix("last-")?
+                .parse()
+                .ok()
+                .filter(|&count: &usize| count > 0)
+        };
         match text {
             "head" => Ok(Self::Head),
             "all" => Ok(Self::Blocks(TrainableBlocks::All)),
@@ -152,13 +164,22 @@ pub fn run(args: TrainArgs) -> anyhow::Result<()> {
             );
             head::train(&args.run)
         }
-        Trainable::Blocks(blocks) => backbone::train(&args.run, blocks, args.augmentation.strengths()),
+        Trainable::Blocks(blocks) => {
+            backbone::train(&args.run, blocks, args.augmentation.strengths())
+        }
     }
 }
 
 impl AugmentArgs {
     fn is_unset(&self) -> bool {
-        [self.brightness, self.contrast, self.saturation, self.viewpoint].iter().all(Option::is_none)
+        [
+            self.brightness,
+            self.contrast,
+            self.saturation,
+            self.viewpoint,
+        ]
+        .iter()
+        .all(Option::is_none)
     }
 
     fn strengths(&self) -> Augmentation {
@@ -179,7 +200,11 @@ impl RunArgs {
         let warm_up = method.warm_up.unwrap_or((method.steps / 10).min(100));
         let config = TrainConfig {
             margin: method.margin,
-            schedule: Schedule { peak: method.learning_rate, warm_up, total: method.steps },
+            schedule: Schedule {
+                peak: method.learning_rate,
+                warm_up,
+                total: method.steps,
+            },
             batch: method.batch,
             steps_per_cycle: method.mine_every,
             negatives: method.negatives,
@@ -202,13 +227,16 @@ impl RunArgs {
 
 /// The bar of a run: steps, and what is known since the last cycle.
 fn bar(config: &TrainConfig) -> anyhow::Result<ProgressBar> {
-    let style = ProgressStyle::with_template("training {wide_bar} {pos}/{len} steps {eta} {prefix} {msg}")?;
+    let style =
+        ProgressStyle::with_template("training {wide_bar} {pos}/{len} steps {eta} {prefix} {msg}")?;
     Ok(ProgressBar::new(config.schedule.total).with_style(style))
 }
 
 fn show(bar: &ProgressBar, progress: Progress<'_>) {
     match progress {
-        Progress::Described { purpose, done, of } => bar.set_prefix(format!("{purpose} {done}/{of} images")),
+        Progress::Described { purpose, done, of } => {
+            bar.set_prefix(format!("{purpose} {done}/{of} images"))
+        }
         Progress::Step { steps, loss } => {
             bar.set_prefix(format!("loss {loss:.4}"));
             bar.set_position(steps);
@@ -237,9 +265,17 @@ fn facts(args: &RunArgs, trainable: &str, data: &str, start: &str) -> Vec<(Strin
 }
 
 /// Notes of a trained head: how it was made, and its validation recall.
-fn notes(args: &RunArgs, input_size: &str, data: &str, outcome: &Outcome) -> BTreeMap<String, String> {
+fn notes(
+    args: &RunArgs,
+    input_size: &str,
+    data: &str,
+    outcome: &Outcome,
+) -> BTreeMap<String, String> {
     let recall = |recall: &crate::train::ValidationRecall| {
-        format!("R@1 {:.1}, R@5 {:.1}, R@10 {:.1}", recall.at_1, recall.at_5, recall.at_10)
+        format!(
+            "R@1 {:.1}, R@5 {:.1}, R@10 {:.1}",
+            recall.at_1, recall.at_5, recall.at_10
+        )
     };
     BTreeMap::from([
         ("method".to_owned(), "triplet margin loss".to_owned()),
@@ -253,13 +289,26 @@ fn notes(args: &RunArgs, input_size: &str, data: &str, outcome: &Outcome) -> BTr
 }
 
 /// Writes the page of a finished run and says how it went.
-fn finish(folder: &Path, facts: &[(String, String)], config: &TrainConfig, outcome: &Outcome) -> anyhow::Result<()> {
+fn finish(
+    folder: &Path,
+    facts: &[(String, String)],
+    config: &TrainConfig,
+    outcome: &Outcome,
+) -> anyhow::Result<()> {
     let path = folder.join("report.html");
-    std::fs::write(&path, report::html(facts, config, &read_log(folder)?, outcome))
-        .with_context(|| format!("cannot write {}", path.display()))?;
+    std::fs::write(
+        &path,
+        report::html(facts, config, &read_log(folder)?, outcome),
+    )
+    .with_context(|| format!("cannot write {}", path.display()))?;
     say!("{}", report::verdict(outcome))?;
     for (name, recall) in [("before", &outcome.initial), ("kept", &outcome.best)] {
-        say!("{name:7} R@1 {:5.1}  R@5 {:5.1}  R@10 {:5.1}", recall.at_1, recall.at_5, recall.at_10)?;
+        say!(
+            "{name:7} R@1 {:5.1}  R@5 {:5.1}  R@10 {:5.1}",
+            recall.at_1,
+            recall.at_5,
+            recall.at_10
+        )?;
     }
     say!("{}", folder.join("head.safetensors").display())?;
     Ok(())

@@ -32,7 +32,8 @@ impl Codec {
     /// What the store keeps.
     pub(super) const INT8: Self = Self::Bits(8);
 
-    /// The store has no codec of fewer bits than 8: their values are rounded as it would, and their size is computed.
+    /// The store has no codec of fewer bits than 8: their values are rounded as it would, and their
+    /// size is computed.
     pub(super) fn name(self) -> String {
         match self {
             Self::INT8 => "int8".into(),
@@ -58,17 +59,22 @@ pub(super) fn apply(
 ) -> Result<PackedPatches, EvalError> {
     match cut {
         Cut::None => Ok(patches.clone()),
-        Cut::FullPrecision => Err(EvalError::Setting("full precision cannot be had from stored patches".into())),
+        Cut::FullPrecision => Err(EvalError::Setting(
+            "full precision cannot be had from stored patches".into(),
+        )),
         Cut::Limits { tau, caps } => Ok(limit(patches, tau, caps)),
         Cut::Codec(Codec::Bits(bits)) => Ok(coarsen(patches, bits)),
         Cut::Codec(Codec::Components(_)) => match components {
             Some(components) => Ok(components.project(patches)),
-            None => Err(EvalError::Setting("principal components were asked for before they were found".into())),
+            None => Err(EvalError::Setting(
+                "principal components were asked for before they were found".into(),
+            )),
         },
     }
 }
 
-/// The patches above `tau`, at most `caps` per scale. Attention is kept in 16 bits, so tau is rounded likewise.
+/// The patches above `tau`, at most `caps` per scale. Attention is kept in 16 bits, so tau is
+/// rounded likewise.
 pub(super) fn limit(patches: &PackedPatches, tau: f32, caps: [usize; SCALES]) -> PackedPatches {
     let tau = half::f16::from_f32(tau);
     let mut kept = PackedPatches {
@@ -82,13 +88,18 @@ pub(super) fn limit(patches: &PackedPatches, tau: f32, caps: [usize; SCALES]) ->
     };
     for scale in 1..=SCALES {
         let rows = patches.rows(scale);
-        let above = patches.attention[rows.clone()].iter().take_while(|&&attention| attention > tau).count();
+        let above = patches.attention[rows.clone()]
+            .iter()
+            .take_while(|&&attention| attention > tau)
+            .count();
         let rows = rows.start..rows.start + above.min(caps[scale - 1]);
         kept.counts[scale - 1] = rows.len();
         kept.index.extend_from_slice(&patches.index[rows.clone()]);
-        kept.attention.extend_from_slice(&patches.attention[rows.clone()]);
+        kept.attention
+            .extend_from_slice(&patches.attention[rows.clone()]);
         kept.factor.extend_from_slice(&patches.factor[rows.clone()]);
-        kept.codes.extend_from_slice(&patches.codes[rows.start * patches.dim..rows.end * patches.dim]);
+        kept.codes
+            .extend_from_slice(&patches.codes[rows.start * patches.dim..rows.end * patches.dim]);
     }
     kept
 }
@@ -97,7 +108,11 @@ pub(super) fn limit(patches: &PackedPatches, tau: f32, caps: [usize; SCALES]) ->
 pub(super) fn coarsen(patches: &PackedPatches, bits: u32) -> PackedPatches {
     let mut coarse = patches.clone();
     let steps = f32::from((1i16 << (bits - 1)) - 1);
-    for (code, factor) in coarse.codes.chunks_mut(patches.dim.max(1)).zip(&mut coarse.factor) {
+    for (code, factor) in coarse
+        .codes
+        .chunks_mut(patches.dim.max(1))
+        .zip(&mut coarse.factor)
+    {
         for value in code.iter_mut() {
             *value = (f32::from(*value) / 127.0 * steps).round() as i8;
         }
@@ -122,32 +137,51 @@ impl Components {
         // Without any key patch there is nothing to project either.
         let n = descriptors.len().checked_div(dim).unwrap_or(0);
         if n == 0 {
-            return Self { mean: DVector::zeros(0), rows: DMatrix::zeros(0, 0) };
+            return Self {
+                mean: DVector::zeros(0),
+                rows: DMatrix::zeros(0, 0),
+            };
         }
-        let mut data = DMatrix::from_row_iterator(n, dim, descriptors.iter().map(|&value| f64::from(value)));
-        let mean = DVector::from_iterator(dim, data.column_iter().map(|column| column.sum() / n as f64));
+        let mut data =
+            DMatrix::from_row_iterator(n, dim, descriptors.iter().map(|&value| f64::from(value)));
+        let mean = DVector::from_iterator(
+            dim,
+            data.column_iter().map(|column| column.sum() / n as f64),
+        );
         for (mut column, mean) in data.column_iter_mut().zip(mean.iter()) {
             column.add_scalar_mut(-mean);
         }
         let eigen = SymmetricEigen::new(data.tr_mul(&data) / n as f64);
         let mut order: Vec<usize> = (0..dim).collect();
         order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
-        let rows = DMatrix::from_fn(count.min(dim), dim, |row, column| eigen.eigenvectors[(column, order[row])]);
+        let rows = DMatrix::from_fn(count.min(dim), dim, |row, column| {
+            eigen.eigenvectors[(column, order[row])]
+        });
         Self { mean, rows }
     }
 
     /// The same patches in these directions, of unit length again.
     fn project(&self, patches: &PackedPatches) -> PackedPatches {
         let dim = self.rows.nrows();
-        let mut short = PackedPatches { dim, codes: Vec::new(), factor: Vec::new(), ..patches.clone() };
+        let mut short = PackedPatches {
+            dim,
+            codes: Vec::new(),
+            factor: Vec::new(),
+            ..patches.clone()
+        };
         for descriptor in unpack(patches) {
             let centred =
-                DVector::from_iterator(descriptor.len(), descriptor.iter().map(|&v| f64::from(v))) - &self.mean;
+                DVector::from_iterator(descriptor.len(), descriptor.iter().map(|&v| f64::from(v)))
+                    - &self.mean;
             let projected = &self.rows * centred;
             let length = projected.norm().max(f64::MIN_POSITIVE);
             let peak = projected.amax().max(f64::MIN_POSITIVE);
             short.factor.push((peak / length / 127.0) as f32);
-            short.codes.extend(projected.iter().map(|value| (value / peak * 127.0).round() as i8));
+            short.codes.extend(
+                projected
+                    .iter()
+                    .map(|value| (value / peak * 127.0).round() as i8),
+            );
         }
         short
     }
@@ -155,6 +189,9 @@ impl Components {
 
 /// The descriptors behind the codes.
 pub(super) fn unpack(patches: &PackedPatches) -> impl Iterator<Item = Vec<f32>> + '_ {
-    let rows = patches.codes.chunks_exact(patches.dim.max(1)).zip(&patches.factor);
+    let rows = patches
+        .codes
+        .chunks_exact(patches.dim.max(1))
+        .zip(&patches.factor);
     rows.map(|(codes, factor)| codes.iter().map(|&code| f32::from(code) * factor).collect())
 }

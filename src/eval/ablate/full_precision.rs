@@ -1,7 +1,9 @@
-//! Re-ranking with descriptors as the model gives them, in f32: what every codec is measured against.
+//! Re-ranking with descriptors as the model gives them, in f32: what every codec is measured
+//! against.
 //!
-//! The store, and so the cache of features, keeps no such descriptors: the candidates are described once more and held in
-//! memory. The similarities are a plain matrix product; pairs are verified by the same homographies.
+//! The store, and so the cache of features, keeps no such descriptors: the candidates are described
+//! once more and held in memory. The similarities are a plain matrix product; pairs are verified by
+//! the same homographies.
 
 use super::EvalError;
 use crate::eval::datasets::{Dataset, Item};
@@ -33,7 +35,11 @@ pub(super) fn rerank_all(
     memory_bytes: u64,
     progress: &ProgressBar,
 ) -> Result<Option<FullPrecision>, EvalError> {
-    let candidates: BTreeSet<usize> = answers.iter().flat_map(|answer| &answer.global).map(|n| n.index).collect();
+    let candidates: BTreeSet<usize> = answers
+        .iter()
+        .flat_map(|answer| &answer.global)
+        .map(|n| n.index)
+        .collect();
     let (mut database, mut bytes) = (BTreeMap::new(), 0);
     for &index in &candidates {
         let whole = Whole::of(&describe(describer, &dataset.database[index])?);
@@ -55,25 +61,46 @@ pub(super) fn rerank_all(
     }
     let mean = |sum: f64, count: usize| sum / count.max(1) as f64;
     let extra_bytes = mean(bytes as f64 * 0.75, database.len());
-    Ok(Some(FullPrecision { seconds: mean(seconds, answers.len()), answers: reranked, extra_bytes }))
+    Ok(Some(FullPrecision {
+        seconds: mean(seconds, answers.len()),
+        answers: reranked,
+        extra_bytes,
+    }))
 }
 
 fn describe(describer: &dyn Describe, item: &Item) -> Result<KeyPatches, EvalError> {
     let bytes = std::fs::read(&item.path).map_err(EvalError::io(&item.path))?;
-    let unreadable = |reason| EvalError::Setting(format!("{} cannot be read any more: {reason}", item.path.display()));
+    let unreadable = |reason| {
+        EvalError::Setting(format!(
+            "{} cannot be read any more: {reason}",
+            item.path.display()
+        ))
+    };
     describer.key_patches(&describer.tensor(&bytes).map_err(unreadable)?)
 }
 
-fn rerank(reranker: &Reranker, query: &Whole, database: &BTreeMap<usize, Whole>, answer: &Answer) -> Answer {
+fn rerank(
+    reranker: &Reranker,
+    query: &Whole,
+    database: &BTreeMap<usize, Whole>,
+    answer: &Answer,
+) -> Answer {
     let rows = query.descriptors.transpose();
     let score = |neighbour: &Neighbour| {
         let score = query.score(&rows, &database[&neighbour.index], reranker);
-        Candidate { index: neighbour.index, distance: neighbour.distance, score }
+        Candidate {
+            index: neighbour.index,
+            distance: neighbour.distance,
+            score,
+        }
     };
     let mut reranked: Vec<Candidate> = answer.global.par_iter().map(score).collect();
     // Stable: ties stay in the global order, as in the service.
     reranked.sort_by_key(|candidate| std::cmp::Reverse(candidate.score.spatial_score));
-    Answer { reranked, ..answer.clone() }
+    Answer {
+        reranked,
+        ..answer.clone()
+    }
 }
 
 /// Key patches of all scales, one after the other.
@@ -89,7 +116,10 @@ struct Whole {
 
 impl Whole {
     fn of(patches: &KeyPatches) -> Self {
-        let values = patches.scales.iter().flat_map(|scale| scale.descriptors.iter().copied());
+        let values = patches
+            .scales
+            .iter()
+            .flat_map(|scale| scale.descriptors.iter().copied());
         let counts = patches.scales.each_ref().map(|scale| scale.index.len());
         let centres = (1..=SCALES).flat_map(|scale| {
             let centre = move |&index: &u32| patches.grid.centre(scale, index as usize);
@@ -129,16 +159,30 @@ impl Whole {
                     [x, y, u, v]
                 })
                 .collect();
-            let inliers = reranker.homography(&points, tolerance_px).map_or(0, |(_, inliers)| inliers);
-            CombinationScore { scales, matches: pairs.len() as u32, inliers }
+            let inliers = reranker
+                .homography(&points, tolerance_px)
+                .map_or(0, |(_, inliers)| inliers);
+            CombinationScore {
+                scales,
+                matches: pairs.len() as u32,
+                inliers,
+            }
         };
-        let combinations: Vec<CombinationScore> = reranker.config().scales.iter().map(combination).collect();
-        PairScore { spatial_score: combinations.iter().map(|c| c.inliers).sum(), combinations }
+        let combinations: Vec<CombinationScore> =
+            reranker.config().scales.iter().map(combination).collect();
+        PairScore {
+            spatial_score: combinations.iter().map(|c| c.inliers).sum(),
+            combinations,
+        }
     }
 }
 
 /// Pairs that are each other's most similar among the rows and columns given; the lowest of equals.
-fn mutual_pairs(similarity: &DMatrix<f32>, rows: &[usize], columns: &[usize]) -> Vec<(usize, usize)> {
+fn mutual_pairs(
+    similarity: &DMatrix<f32>,
+    rows: &[usize],
+    columns: &[usize],
+) -> Vec<(usize, usize)> {
     let mut best_of_row = vec![(f32::NEG_INFINITY, usize::MAX); similarity.nrows()];
     let mut best_of_column = vec![(f32::NEG_INFINITY, usize::MAX); similarity.ncols()];
     for &column in columns {
@@ -153,8 +197,12 @@ fn mutual_pairs(similarity: &DMatrix<f32>, rows: &[usize], columns: &[usize]) ->
         }
     }
     // A row that nothing was compared with has no partner.
-    let partner = |&row: &usize| Some((row, best_of_row[row].1)).filter(|&(_, column)| column != usize::MAX);
-    rows.iter().filter_map(partner).filter(|&(row, column)| best_of_column[column].1 == row).collect()
+    let partner =
+        |&row: &usize| Some((row, best_of_row[row].1)).filter(|&(_, column)| column != usize::MAX);
+    rows.iter()
+        .filter_map(partner)
+        .filter(|&(row, column)| best_of_column[column].1 == row)
+        .collect()
 }
 
 #[cfg(test)]
@@ -173,19 +221,38 @@ mod tests {
 
     /// Patches of one place seen twice, `shift` columns apart, each with some noise of its own.
     fn seen(shift: u32, seed: u64) -> KeyPatches {
-        let grid = PatchGrid { columns: 12, rows: 9, patch_px: 14, stride: PoolingStride::Kernel };
-        let (mut place, mut noise) = (ChaCha8Rng::seed_from_u64(5), ChaCha8Rng::seed_from_u64(seed));
+        let grid = PatchGrid {
+            columns: 12,
+            rows: 9,
+            patch_px: 14,
+            stride: PoolingStride::Kernel,
+        };
+        let (mut place, mut noise) = (
+            ChaCha8Rng::seed_from_u64(5),
+            ChaCha8Rng::seed_from_u64(seed),
+        );
         let mut scale = |columns: u32, count: u32, shift: u32| {
             let mut descriptors = Vec::new();
             for _ in 0..count {
-                let values: Vec<f32> =
-                    (0..DIM).map(|_| place.random_range(-1f32..1.0) + 0.2 * noise.random_range(-1f32..1.0)).collect();
+                let values: Vec<f32> = (0..DIM)
+                    .map(|_| place.random_range(-1f32..1.0) + 0.2 * noise.random_range(-1f32..1.0))
+                    .collect();
                 descriptors.extend(unit(&values));
             }
-            let index = (0..count).map(|n| n / (columns - 2) * columns + n % (columns - 2) + shift).collect();
-            ScaleKeyPatches { index, attention: vec![2.0; count as usize], descriptors }
+            let index = (0..count)
+                .map(|n| n / (columns - 2) * columns + n % (columns - 2) + shift)
+                .collect();
+            ScaleKeyPatches {
+                index,
+                attention: vec![2.0; count as usize],
+                descriptors,
+            }
         };
-        KeyPatches { grid, dim: DIM, scales: [scale(12, 50, shift), scale(6, 12, 0), scale(4, 4, 0)] }
+        KeyPatches {
+            grid,
+            dim: DIM,
+            scales: [scale(12, 50, shift), scale(6, 12, 0), scale(4, 4, 0)],
+        }
     }
 
     #[test]
@@ -194,16 +261,23 @@ mod tests {
         let reranker = Reranker::new(RerankConfig::default());
         let (a, b) = (Whole::of(&query), Whole::of(&reference));
         let full = a.score(&a.descriptors.transpose(), &b, &reranker);
-        let packed = reranker.score(&PackedPatches::quantise(&query), &PackedPatches::quantise(&reference));
+        let packed = reranker.score(
+            &PackedPatches::quantise(&query),
+            &PackedPatches::quantise(&reference),
+        );
         assert_eq!(full, packed);
         assert!(full.combinations[0].inliers >= 45, "{full:?}");
     }
 
     #[test]
     fn only_each_others_nearest_are_pairs_and_only_within_the_union() {
-        let similarity = DMatrix::from_row_slice(3, 3, &[0.9, 0.1, 0.8, 0.95, 0.2, 0.1, 0.3, 0.2, 0.1]);
+        let similarity =
+            DMatrix::from_row_slice(3, 3, &[0.9, 0.1, 0.8, 0.95, 0.2, 0.1, 0.3, 0.2, 0.1]);
         assert_eq!(mutual_pairs(&similarity, &[0, 1, 2], &[0, 1, 2]), [(1, 0)]);
-        assert_eq!(mutual_pairs(&similarity, &[0, 1, 2], &[1, 2]), [(0, 2), (1, 1)]);
+        assert_eq!(
+            mutual_pairs(&similarity, &[0, 1, 2], &[1, 2]),
+            [(0, 2), (1, 1)]
+        );
         assert_eq!(mutual_pairs(&similarity, &[], &[0, 1, 2]), []);
     }
 }

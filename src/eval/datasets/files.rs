@@ -6,18 +6,30 @@ use walkdir::WalkDir;
 
 const EXTENSIONS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
 
-/// Every image below `folder` as (name, path), by name. The name is the path below `folder` with `/` on every system.
+/// Every image below `folder` as (name, path), by name. The name is the path below `folder` with
+/// `/` on every system.
 ///
 /// Hidden files and folders are not looked at: file managers leave previews there.
 pub fn list_images(folder: &Path) -> Result<Vec<(String, PathBuf)>, EvalError> {
     let visible = |entry: &walkdir::DirEntry| {
-        entry.depth() == 0 || !entry.file_name().to_str().is_some_and(|name| name.starts_with('.'))
+        entry.depth() == 0
+            || !entry
+                .file_name()
+                .to_str()
+                .is_some_and(|name| name.starts_with('.'))
     };
     let mut images = Vec::new();
-    for entry in WalkDir::new(folder).follow_links(true).into_iter().filter_entry(visible) {
+    for entry in WalkDir::new(folder)
+        .follow_links(true)
+        .into_iter()
+        .filter_entry(visible)
+    {
         let entry = entry.map_err(|error| {
             let path = error.path().unwrap_or(folder).to_owned();
-            EvalError::Io { path, source: error.into() }
+            EvalError::Io {
+                path,
+                source: error.into(),
+            }
         })?;
         if entry.file_type().is_file() && is_image(entry.path()) {
             images.push((relative_name(folder, entry.path()), entry.into_path()));
@@ -30,18 +42,38 @@ pub fn list_images(folder: &Path) -> Result<Vec<(String, PathBuf)>, EvalError> {
 /// The path below `folder`, with `/` on every system.
 pub fn relative_name(folder: &Path, path: &Path) -> String {
     let below = path.strip_prefix(folder).unwrap_or(path);
-    below.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("/")
+    below
+        .iter()
+        .map(|part| part.to_string_lossy())
+        .collect::<Vec<_>>()
+        .join("/")
 }
 
 fn is_image(path: &Path) -> bool {
     path.extension()
         .and_then(|extension| extension.to_str())
-        .is_some_and(|extension| EXTENSIONS.iter().any(|known| extension.eq_ignore_ascii_case(known)))
+        .is_some_and(|extension| {
+            EXTENSIONS
+                .iter()
+                .any(|known| extension.eq_ignore_ascii_case(known))
+        })
 }
 
 /// The folder, or an error that says what the layout should be.
-pub(super) fn require(dataset: &'static str, path: PathBuf, expected: &'static str) -> Result<PathBuf, EvalError> {
-    if path.exists() { Ok(path) } else { Err(EvalError::Layout { dataset, path, expected }) }
+pub(super) fn require(
+    dataset: &'static str,
+    path: PathBuf,
+    expected: &'static str,
+) -> Result<PathBuf, EvalError> {
+    if path.exists() {
+        Ok(path)
+    } else {
+        Err(EvalError::Layout {
+            dataset,
+            path,
+            expected,
+        })
+    }
 }
 
 #[cfg(test)]
@@ -51,12 +83,24 @@ mod tests {
     #[test]
     fn images_are_listed_by_name_whatever_their_case_and_depth() {
         let root = tempfile::tempdir().unwrap();
-        for name in ["b/2.JPG", "a.png", "b/1.jpeg", "notes.txt", ".hidden/x.jpg", "b/.y.jpg", "z.webp"] {
+        for name in [
+            "b/2.JPG",
+            "a.png",
+            "b/1.jpeg",
+            "notes.txt",
+            ".hidden/x.jpg",
+            "b/.y.jpg",
+            "z.webp",
+        ] {
             let path = root.path().join(name);
             std::fs::create_dir_all(path.parent().unwrap()).unwrap();
             std::fs::write(path, b"x").unwrap();
         }
-        let names: Vec<String> = list_images(root.path()).unwrap().into_iter().map(|(name, _)| name).collect();
+        let names: Vec<String> = list_images(root.path())
+            .unwrap()
+            .into_iter()
+            .map(|(name, _)| name)
+            .collect();
         assert_eq!(names, ["a.png", "b/1.jpeg", "b/2.JPG", "z.webp"]);
     }
 

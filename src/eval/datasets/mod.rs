@@ -1,8 +1,8 @@
 //! Reads the data sets of the field in the layouts in which people have them.
 //!
-//! Every reader answers with the same [`Dataset`]: the images of both sides, and for each query its [`Truth`]. What
-//! a reader leaves out (panoramas, rows without a position) it lists in `skipped`; what it had to decide it says in
-//! `notes`; nothing is dropped in silence.
+//! Every reader answers with the same [`Dataset`]: the images of both sides, and for each query its
+//! [`Truth`]. What a reader leaves out (panoramas, rows without a position) it lists in `skipped`;
+//! what it had to decide it says in `notes`; nothing is dropped in silence.
 
 mod files;
 mod msls;
@@ -37,7 +37,8 @@ pub struct MetricPoint {
 /// One image of a data set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Item {
-    /// Unique on its side of the data set: the path below the image folder, with `/`, or the data set's own key.
+    /// Unique on its side of the data set: the path below the image folder, with `/`, or the data
+    /// set's own key.
     pub name: String,
     /// The file.
     pub path: PathBuf,
@@ -54,7 +55,14 @@ pub struct Item {
 impl Item {
     /// An image of which only the file is known.
     pub fn new(name: impl Into<String>, path: impl Into<PathBuf>) -> Self {
-        Self { name: name.into(), path: path.into(), position: None, heading: None, pose: None, group: None }
+        Self {
+            name: name.into(),
+            path: path.into(),
+            position: None,
+            heading: None,
+            pose: None,
+            group: None,
+        }
     }
 }
 
@@ -74,7 +82,11 @@ impl Truth {
     pub fn from_positives(mut positives: Vec<usize>) -> Self {
         positives.sort_unstable();
         positives.dedup();
-        if positives.is_empty() { Self::NoMatch } else { Self::Positives(positives) }
+        if positives.is_empty() {
+            Self::NoMatch
+        } else {
+            Self::Positives(positives)
+        }
     }
 
     /// The positives; empty unless a match exists and is known.
@@ -120,11 +132,21 @@ impl Dataset {
             if items.is_empty() {
                 let detail = match self.skipped.first() {
                     Some(first) => {
-                        format!("; {} were skipped, first {}: {}", self.skipped.len(), first.name, first.reason)
+                        format!(
+                            "; {} were skipped, first {}: {}",
+                            self.skipped.len(),
+                            first.name,
+                            first.reason
+                        )
                     }
                     None => String::new(),
                 };
-                return Err(EvalError::Empty { dataset: self.name, side, path: root.to_owned(), detail });
+                return Err(EvalError::Empty {
+                    dataset: self.name,
+                    side,
+                    path: root.to_owned(),
+                    detail,
+                });
             }
         }
         Ok(self)
@@ -132,7 +154,10 @@ impl Dataset {
 
     /// How many queries have at least one known positive.
     pub fn queries_with_match(&self) -> usize {
-        self.truth.iter().filter(|truth| matches!(truth, Truth::Positives(_))).count()
+        self.truth
+            .iter()
+            .filter(|truth| matches!(truth, Truth::Positives(_)))
+            .count()
     }
 }
 
@@ -155,7 +180,8 @@ pub enum DatasetKind {
     RobotcarSeasonsV2,
     /// Any set with `@utm_east@utm_north@...` names.
     Utm,
-    /// `database/`, `queries/` and `ground_truth.csv` below the root; positions from `positions.csv` if it is there.
+    /// `database/`, `queries/` and `ground_truth.csv` below the root; positions from
+    /// `positions.csv` if it is there.
     Csv,
 }
 
@@ -184,11 +210,13 @@ impl Split {
 /// How a data set is to be read. `None` is the data set's own default.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DatasetOptions {
-    /// Which part; the default is `test`, except `val` for MSLS and `train` for RobotCar, whose poses there are public.
+    /// Which part; the default is `test`, except `val` for MSLS and `train` for RobotCar, whose
+    /// poses there are public.
     pub split: Option<Split>,
     /// Greatest distance of a positive in metres (paper IV: 25).
     pub radius_m: f64,
-    /// Greatest difference of view angles of a positive in degrees; the default is 40 for MSLS, else no rule.
+    /// Greatest difference of view angles of a positive in degrees; the default is 40 for MSLS,
+    /// else no rule.
     pub max_angle_deg: Option<f64>,
     /// Greatest frame distance of a positive (Nordland).
     pub frame_tolerance: u64,
@@ -227,16 +255,20 @@ impl DatasetOptions {
             )));
         }
         match self.max_angle_deg {
-            Some(angle) if !(0.0..=180.0).contains(&angle) => {
-                Err(EvalError::Setting(format!("the view angle must be 0 to 180 degrees, not {angle}")))
-            }
+            Some(angle) if !(0.0..=180.0).contains(&angle) => Err(EvalError::Setting(format!(
+                "the view angle must be 0 to 180 degrees, not {angle}"
+            ))),
             _ => Ok(()),
         }
     }
 }
 
 /// Reads a data set.
-pub fn load(kind: DatasetKind, root: &Path, options: &DatasetOptions) -> Result<Dataset, EvalError> {
+pub fn load(
+    kind: DatasetKind,
+    root: &Path,
+    options: &DatasetOptions,
+) -> Result<Dataset, EvalError> {
     options.check()?;
     let dataset = match kind {
         DatasetKind::MslsVal => msls::load_labelled(root, options)?,
@@ -247,7 +279,11 @@ pub fn load(kind: DatasetKind, root: &Path, options: &DatasetOptions) -> Result<
         DatasetKind::Nordland => nordland::load(root, options)?,
         DatasetKind::RobotcarSeasonsV2 => robotcar::load(root, options)?,
         DatasetKind::Csv => {
-            return load_pairs(&root.join("database"), &root.join("queries"), &root.join("ground_truth.csv"));
+            return load_pairs(
+                &root.join("database"),
+                &root.join("queries"),
+                &root.join("ground_truth.csv"),
+            );
         }
     };
     dataset.checked(root)

@@ -1,7 +1,7 @@
 //! Which database images lie within a radius of a query, without comparing all pairs.
 //!
-//! Points are hashed into square cells as wide as the radius, so that all neighbours of a point lie in the 3x3 cells
-//! around it: a million images join in seconds.
+//! Points are hashed into square cells as wide as the radius, so that all neighbours of a point lie
+//! in the 3x3 cells around it: a million images join in seconds.
 
 use super::{Item, MetricPoint, Truth};
 use std::collections::HashMap;
@@ -17,7 +17,10 @@ impl NeighbourGrid {
     pub fn new(radius_m: f64, points: impl IntoIterator<Item = (usize, MetricPoint)>) -> Self {
         let mut cells: HashMap<_, Vec<_>> = HashMap::new();
         for (index, point) in points {
-            cells.entry(cell(point, radius_m)).or_default().push((index, point));
+            cells
+                .entry(cell(point, radius_m))
+                .or_default()
+                .push((index, point));
         }
         Self { radius_m, cells }
     }
@@ -39,7 +42,10 @@ impl NeighbourGrid {
 }
 
 fn cell(point: MetricPoint, width: f64) -> (i64, i64) {
-    ((point.east / width).floor() as i64, (point.north / width).floor() as i64)
+    (
+        (point.east / width).floor() as i64,
+        (point.north / width).floor() as i64,
+    )
 }
 
 /// Smallest difference of two directions, 0 to 180 degrees.
@@ -50,25 +56,31 @@ pub(super) fn angle_between(a: f64, b: f64) -> f64 {
 
 /// What the radius, and where both headings are known the view angle, say about every query.
 ///
-/// A query without a position gets [`Truth::Unknown`]. Images whose group differs are never positives: the metric
-/// coordinates of two cities may coincide.
+/// A query without a position gets [`Truth::Unknown`]. Images whose group differs are never
+/// positives: the metric coordinates of two cities may coincide.
 pub(super) fn truth_by_distance(
     database: &[Item],
     queries: &[Item],
     radius_m: f64,
     max_angle_deg: Option<f64>,
 ) -> Vec<Truth> {
-    let located = database.iter().enumerate().filter_map(|(index, item)| Some((index, item.position?)));
+    let located = database
+        .iter()
+        .enumerate()
+        .filter_map(|(index, item)| Some((index, item.position?)));
     let grid = NeighbourGrid::new(radius_m, located);
-    let same_view = |query: &Item, reference: &Item| match (max_angle_deg, query.heading, reference.heading) {
-        (Some(limit), Some(a), Some(b)) => angle_between(a, b) <= limit,
-        _ => true,
-    };
+    let same_view =
+        |query: &Item, reference: &Item| match (max_angle_deg, query.heading, reference.heading) {
+            (Some(limit), Some(a), Some(b)) => angle_between(a, b) <= limit,
+            _ => true,
+        };
     let truth_of = |query: &Item| match query.position {
         None => Truth::Unknown,
         Some(position) => Truth::from_positives(
             grid.within(position)
-                .filter(|&index| database[index].group == query.group && same_view(query, &database[index]))
+                .filter(|&index| {
+                    database[index].group == query.group && same_view(query, &database[index])
+                })
                 .collect(),
         ),
     };
@@ -86,7 +98,14 @@ mod tests {
 
     #[test]
     fn the_radius_is_inclusive_and_angles_wrap() {
-        let grid = NeighbourGrid::new(25.0, [(0, point(0.0, 0.0)), (1, point(25.0, 0.0)), (2, point(25.01, 0.0))]);
+        let grid = NeighbourGrid::new(
+            25.0,
+            [
+                (0, point(0.0, 0.0)),
+                (1, point(25.0, 0.0)),
+                (2, point(25.01, 0.0)),
+            ],
+        );
         let mut found: Vec<_> = grid.within(point(0.0, 0.0)).collect();
         found.sort_unstable();
         assert_eq!(found, [0, 1]);
@@ -96,7 +115,11 @@ mod tests {
 
     #[test]
     fn the_view_angle_counts_only_where_both_are_known() {
-        let at = |heading| Item { position: Some(point(1.0, 1.0)), heading, ..Item::new("x", "x") };
+        let at = |heading| Item {
+            position: Some(point(1.0, 1.0)),
+            heading,
+            ..Item::new("x", "x")
+        };
         let database = [at(Some(0.0)), at(Some(90.0)), at(None)];
         let queries = [at(Some(320.0)), at(None), Item::new("lost", "lost")];
         let truth = truth_by_distance(&database, &queries, 25.0, Some(40.0));

@@ -1,9 +1,11 @@
-//! Nordland: one railway filmed in four seasons, aligned frame by frame; positives lie within some frames.
+//! Nordland: one railway filmed in four seasons, aligned frame by frame; positives lie within some
+//! frames.
 //!
-//! Two layouts: the downloader's (`images/test/{database,queries}`, the frame in the seventh field of an
-//! `@utm_east@utm_north@...` name) and the films' own folders (`summer/` and `winter/`, the frame at the end of the
-//! name, such as `images-00042.png`). Where `cleanImageNames.txt` lies beside them, only the frames it lists take part:
-//! the usual evaluation leaves tunnels and stations out.
+//! Two layouts: the downloader's (`images/test/{database,queries}`, the frame in the seventh field
+//! of an `@utm_east@utm_north@...` name) and the films' own folders (`summer/` and `winter/`, the
+//! frame at the end of the name, such as `images-00042.png`). Where `cleanImageNames.txt` lies
+//! beside them, only the frames it lists take part: the usual evaluation leaves tunnels and
+//! stations out.
 
 use super::files::{list_images, require};
 use super::utm::find_split;
@@ -16,7 +18,8 @@ use std::path::{Path, PathBuf};
 const NAME: &str = "nordland";
 /// Names of the frames that take part, one a line.
 const CLEAN: &str = "cleanImageNames.txt";
-const EXPECTED: &str = "images/test/{database,queries}, or summer/ (database) and winter/ (queries)";
+const EXPECTED: &str =
+    "images/test/{database,queries}, or summer/ (database) and winter/ (queries)";
 
 /// Reads both sides and matches them by frame.
 pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, EvalError> {
@@ -31,30 +34,56 @@ pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, Eva
         for (name, path) in list_images(folder)? {
             match frame_of(&name) {
                 Some(frame) if clean.as_ref().is_some_and(|clean| !clean.contains(&frame)) => {
-                    skipped.push(Skipped { name, reason: format!("not in {CLEAN}") });
+                    skipped.push(Skipped {
+                        name,
+                        reason: format!("not in {CLEAN}"),
+                    });
                 }
                 Some(frame) => {
                     items.push(Item::new(name, path));
                     frames.push(frame);
                 }
-                None => skipped.push(Skipped { name, reason: "the name has no frame number".into() }),
+                None => skipped.push(Skipped {
+                    name,
+                    reason: "the name has no frame number".into(),
+                }),
             }
         }
         Ok((items, frames))
     };
     let (database, database_frames) = read(&database_dir)?;
     let (queries, query_frames) = read(&queries_dir)?;
-    let mut by_frame: Vec<(u64, usize)> = database_frames.iter().enumerate().map(|(i, &frame)| (frame, i)).collect();
+    let mut by_frame: Vec<(u64, usize)> = database_frames
+        .iter()
+        .enumerate()
+        .map(|(i, &frame)| (frame, i))
+        .collect();
     by_frame.sort_unstable();
-    let truth = query_frames.iter().map(|&frame| truth_of(frame, options.frame_tolerance, &by_frame)).collect();
-    let mut notes = vec![format!("positives lie within {} frames", options.frame_tolerance)];
+    let truth = query_frames
+        .iter()
+        .map(|&frame| truth_of(frame, options.frame_tolerance, &by_frame))
+        .collect();
+    let mut notes = vec![format!(
+        "positives lie within {} frames",
+        options.frame_tolerance
+    )];
     if let Some(clean) = clean {
-        notes.push(format!("only the {} frames of {CLEAN} take part", clean.len()));
+        notes.push(format!(
+            "only the {} frames of {CLEAN} take part",
+            clean.len()
+        ));
     }
     if options.swap {
         notes.push("the seasons are exchanged: what is usually asked is searched".into());
     }
-    Ok(Dataset { name: NAME.into(), database, queries, truth, skipped, notes })
+    Ok(Dataset {
+        name: NAME.into(),
+        database,
+        queries,
+        truth,
+        skipped,
+        notes,
+    })
 }
 
 /// The frames that take part, if the data set says so.
@@ -66,9 +95,16 @@ fn clean_frames(root: &Path) -> Result<Option<BTreeSet<u64>>, EvalError> {
         Err(error) => return Err(EvalError::io(&path)(error)),
     };
     let mut frames = BTreeSet::new();
-    for (line, name) in (1..).zip(text.lines().map(str::trim)).filter(|(_, name)| !name.is_empty()) {
+    for (line, name) in (1..)
+        .zip(text.lines().map(str::trim))
+        .filter(|(_, name)| !name.is_empty())
+    {
         let reason = || format!("{name:?} has no frame number");
-        let frame = frame_of(name).ok_or_else(|| EvalError::Record { path: path.clone(), line, reason: reason() })?;
+        let frame = frame_of(name).ok_or_else(|| EvalError::Record {
+            path: path.clone(),
+            line,
+            reason: reason(),
+        })?;
         frames.insert(frame);
     }
     Ok(Some(frames))
@@ -80,8 +116,15 @@ fn folders(root: &Path, split: Split) -> Result<(PathBuf, PathBuf), EvalError> {
         return Ok(films);
     }
     let nested = || root.join("images").join(split.as_str());
-    let folder = require(NAME, find_split(root, split).unwrap_or_else(nested), EXPECTED)?;
-    Ok((require(NAME, folder.join("database"), EXPECTED)?, require(NAME, folder.join("queries"), EXPECTED)?))
+    let folder = require(
+        NAME,
+        find_split(root, split).unwrap_or_else(nested),
+        EXPECTED,
+    )?;
+    Ok((
+        require(NAME, folder.join("database"), EXPECTED)?,
+        require(NAME, folder.join("queries"), EXPECTED)?,
+    ))
 }
 
 fn frame_of(name: &str) -> Option<u64> {
@@ -96,7 +139,9 @@ fn frame_of(name: &str) -> Option<u64> {
 
 fn truth_of(frame: u64, tolerance: u64, by_frame: &[(u64, usize)]) -> Truth {
     let start = by_frame.partition_point(|&(other, _)| other < frame.saturating_sub(tolerance));
-    let within = by_frame[start..].iter().take_while(|&&(other, _)| other <= frame.saturating_add(tolerance));
+    let within = by_frame[start..]
+        .iter()
+        .take_while(|&&(other, _)| other <= frame.saturating_add(tolerance));
     Truth::from_positives(within.map(|&(_, index)| index).collect())
 }
 
@@ -117,17 +162,46 @@ mod tests {
     fn downloader_names_match_by_frame_not_by_text_order() {
         let root = tempfile::tempdir().unwrap();
         // Sorted as text, frame 100 comes before frame 20.
-        let database =
-            [0, 9, 20, 31, 100].map(|f| format!("images/test/database/@0@{:.1}@@@@@{f}@@@@@@@@.jpg", f as f64 * 2.4));
-        let queries = [10, 50].map(|f| format!("images/test/queries/@0@{:.1}@@@@@{f}@@@@@@@@.jpg", f as f64 * 2.4));
+        let database = [0, 9, 20, 31, 100].map(|f| {
+            format!(
+                "images/test/database/@0@{:.1}@@@@@{f}@@@@@@@@.jpg",
+                f as f64 * 2.4
+            )
+        });
+        let queries = [10, 50].map(|f| {
+            format!(
+                "images/test/queries/@0@{:.1}@@@@@{f}@@@@@@@@.jpg",
+                f as f64 * 2.4
+            )
+        });
         write(root.path(), &database);
         write(root.path(), &queries);
-        write(root.path(), &["images/test/queries/@0@1@@@@@@@@@@@@@@.jpg".to_owned()]);
-        let dataset = load_dataset(DatasetKind::Nordland, root.path(), &DatasetOptions::default()).unwrap();
-        let frames: Vec<_> = dataset.database.iter().map(|item| frame_of(&item.name).unwrap()).collect();
+        write(
+            root.path(),
+            &["images/test/queries/@0@1@@@@@@@@@@@@@@.jpg".to_owned()],
+        );
+        let dataset = load_dataset(
+            DatasetKind::Nordland,
+            root.path(),
+            &DatasetOptions::default(),
+        )
+        .unwrap();
+        let frames: Vec<_> = dataset
+            .database
+            .iter()
+            .map(|item| frame_of(&item.name).unwrap())
+            .collect();
         let positives = |frame| {
-            let query = dataset.queries.iter().position(|query| frame_of(&query.name) == Some(frame)).unwrap();
-            let mut found: Vec<u64> = dataset.truth[query].positives().iter().map(|&i| frames[i]).collect();
+            let query = dataset
+                .queries
+                .iter()
+                .position(|query| frame_of(&query.name) == Some(frame))
+                .unwrap();
+            let mut found: Vec<u64> = dataset.truth[query]
+                .positives()
+                .iter()
+                .map(|&i| frames[i])
+                .collect();
             found.sort_unstable();
             found
         };
@@ -138,10 +212,17 @@ mod tests {
     #[test]
     fn film_folders_match_by_the_number_at_the_end() {
         let root = tempfile::tempdir().unwrap();
-        let film = |season: &str| (0..30).map(|i| format!("{season}/images-{i:05}.png")).collect::<Vec<_>>();
+        let film = |season: &str| {
+            (0..30)
+                .map(|i| format!("{season}/images-{i:05}.png"))
+                .collect::<Vec<_>>()
+        };
         write(root.path(), &film("summer"));
         write(root.path(), &film("winter"));
-        let options = DatasetOptions { frame_tolerance: 1, ..Default::default() };
+        let options = DatasetOptions {
+            frame_tolerance: 1,
+            ..Default::default()
+        };
         let dataset = load_dataset(DatasetKind::Nordland, root.path(), &options).unwrap();
         assert_eq!(dataset.truth[0], Truth::Positives(vec![0, 1]));
         assert_eq!(dataset.truth[17], Truth::Positives(vec![16, 17, 18]));
@@ -150,16 +231,33 @@ mod tests {
     #[test]
     fn only_clean_frames_take_part_and_the_seasons_can_be_exchanged() {
         let root = tempfile::tempdir().unwrap();
-        write(root.path(), &(0..8).map(|i| format!("summer/images-{i:05}.png")).collect::<Vec<_>>());
-        write(root.path(), &(0..6).map(|i| format!("winter/images-{i:05}.png")).collect::<Vec<_>>());
-        let options = |swap| DatasetOptions { frame_tolerance: 1, swap, ..Default::default() };
+        write(
+            root.path(),
+            &(0..8)
+                .map(|i| format!("summer/images-{i:05}.png"))
+                .collect::<Vec<_>>(),
+        );
+        write(
+            root.path(),
+            &(0..6)
+                .map(|i| format!("winter/images-{i:05}.png"))
+                .collect::<Vec<_>>(),
+        );
+        let options = |swap| DatasetOptions {
+            frame_tolerance: 1,
+            swap,
+            ..Default::default()
+        };
         let load = |swap| load_dataset(DatasetKind::Nordland, root.path(), &options(swap));
         let sides = |dataset: &Dataset| (dataset.database.len(), dataset.queries.len());
         assert_eq!(sides(&load(false).unwrap()), (8, 6));
         assert_eq!(sides(&load(true).unwrap()), (6, 8));
         let list = root.path().join(CLEAN);
-        std::fs::write(&list, "images-00000.png\r\nimages-00003.png\r\nimages-00004.png\r\nimages-00007.png\r\n")
-            .unwrap();
+        std::fs::write(
+            &list,
+            "images-00000.png\r\nimages-00003.png\r\nimages-00004.png\r\nimages-00007.png\r\n",
+        )
+        .unwrap();
         let clean = load(false).unwrap();
         assert_eq!((sides(&clean), clean.skipped.len()), ((4, 3), 4 + 3));
         assert_eq!(clean.truth[0], Truth::Positives(vec![0]));
@@ -167,6 +265,11 @@ mod tests {
         let swapped = load(true).unwrap();
         assert_eq!(swapped.truth[3], Truth::NoMatch);
         std::fs::write(&list, "images-00000.png\ntunnel.png\n").unwrap();
-        assert!(load(false).unwrap_err().to_string().contains("line 2: \"tunnel.png\""));
+        assert!(
+            load(false)
+                .unwrap_err()
+                .to_string()
+                .contains("line 2: \"tunnel.png\"")
+        );
     }
 }

@@ -1,7 +1,8 @@
 //! The plainest layout: two folders and a CSV of accepted pairs.
 //!
-//! `query,reference`, one pair a row; an empty reference says that no match exists. Names are paths below the two
-//! folders. A query the file does not mention stays [`Truth::Unknown`]: it is searched but not counted.
+//! `query,reference`, one pair a row; an empty reference says that no match exists. Names are paths
+//! below the two folders. A query the file does not mention stays [`Truth::Unknown`]: it is
+//! searched but not counted.
 
 use super::files::list_images;
 use super::table::Table;
@@ -10,8 +11,13 @@ use crate::eval::EvalError;
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Reads the images of both folders, the pairs between them, and positions from a `positions.csv` beside the pairs.
-pub fn load_pairs(database_dir: &Path, queries_dir: &Path, ground_truth: &Path) -> Result<Dataset, EvalError> {
+/// Reads the images of both folders, the pairs between them, and positions from a `positions.csv`
+/// beside the pairs.
+pub fn load_pairs(
+    database_dir: &Path,
+    queries_dir: &Path,
+    ground_truth: &Path,
+) -> Result<Dataset, EvalError> {
     let mut database = items(database_dir)?;
     let mut queries = items(queries_dir)?;
     if let Some(folder) = ground_truth.parent() {
@@ -21,15 +27,31 @@ pub fn load_pairs(database_dir: &Path, queries_dir: &Path, ground_truth: &Path) 
     let table = Table::read(ground_truth)?;
     let (query_column, reference_column) = (table.column("query")?, table.column("reference")?);
     for row in table.rows() {
-        labels.add(row.text(query_column), row.text(reference_column)).map_err(|reason| row.error(reason))?;
+        labels
+            .add(row.text(query_column), row.text(reference_column))
+            .map_err(|reason| row.error(reason))?;
     }
     let (truth, notes) = labels.finish()?;
-    let name = ground_truth.parent().and_then(Path::file_name).map_or("csv".into(), |name| name.to_string_lossy());
-    Dataset { name: name.into_owned(), database, queries, truth, skipped: Vec::new(), notes }.checked(database_dir)
+    let name = ground_truth
+        .parent()
+        .and_then(Path::file_name)
+        .map_or("csv".into(), |name| name.to_string_lossy());
+    Dataset {
+        name: name.into_owned(),
+        database,
+        queries,
+        truth,
+        skipped: Vec::new(),
+        notes,
+    }
+    .checked(database_dir)
 }
 
 fn items(folder: &Path) -> Result<Vec<Item>, EvalError> {
-    Ok(list_images(folder)?.into_iter().map(|(name, path)| Item::new(name, path)).collect())
+    Ok(list_images(folder)?
+        .into_iter()
+        .map(|(name, path)| Item::new(name, path))
+        .collect())
 }
 
 /// Collects the rows of a ground truth, and the names in it that nobody has.
@@ -50,7 +72,13 @@ impl<'a> Labels<'a> {
         queries: &'a [Item],
         ground_truth: &'a Path,
     ) -> Self {
-        let by_name = |items: &'a [Item]| items.iter().enumerate().map(|(i, item)| (item.name.as_str(), i)).collect();
+        let by_name = |items: &'a [Item]| {
+            items
+                .iter()
+                .enumerate()
+                .map(|(i, item)| (item.name.as_str(), i))
+                .collect()
+        };
         Self {
             folders: [queries_dir, database_dir],
             ground_truth,
@@ -66,7 +94,11 @@ impl<'a> Labels<'a> {
             self.unknown[0].push(query.to_owned());
             return Ok(());
         };
-        let contradiction = || Err(format!("{query:?} has both a reference and an empty row, which says it has none"));
+        let contradiction = || {
+            Err(format!(
+                "{query:?} has both a reference and an empty row, which says it has none"
+            ))
+        };
         if reference.is_empty() {
             if matches!(self.truth[index], Truth::Positives(_)) {
                 return contradiction();
@@ -91,8 +123,14 @@ impl<'a> Labels<'a> {
             names.sort_unstable();
             names.dedup();
             if let Some(example) = names.first().cloned() {
-                let (path, folder, count) = (self.ground_truth.to_owned(), folder.to_owned(), names.len());
-                return Err(EvalError::UnknownImages { path, folder, count, example });
+                let (path, folder, count) =
+                    (self.ground_truth.to_owned(), folder.to_owned(), names.len());
+                return Err(EvalError::UnknownImages {
+                    path,
+                    folder,
+                    count,
+                    example,
+                });
             }
         }
         let mut truth = self.truth;
@@ -101,9 +139,20 @@ impl<'a> Labels<'a> {
                 *entry = Truth::from_positives(std::mem::take(positives));
             }
         }
-        let unlabelled = truth.iter().filter(|entry| **entry == Truth::Unknown).count();
-        let note = format!("{unlabelled} queries are not in the ground truth: searched, but not counted");
-        Ok((truth, if unlabelled > 0 { vec![note] } else { Vec::new() }))
+        let unlabelled = truth
+            .iter()
+            .filter(|entry| **entry == Truth::Unknown)
+            .count();
+        let note =
+            format!("{unlabelled} queries are not in the ground truth: searched, but not counted");
+        Ok((
+            truth,
+            if unlabelled > 0 {
+                vec![note]
+            } else {
+                Vec::new()
+            },
+        ))
     }
 }
 
@@ -123,18 +172,33 @@ mod tests {
     }
 
     fn load(root: &Path) -> Result<Dataset, EvalError> {
-        load_pairs(&root.join("database"), &root.join("queries"), &root.join("ground_truth.csv"))
+        load_pairs(
+            &root.join("database"),
+            &root.join("queries"),
+            &root.join("ground_truth.csv"),
+        )
     }
 
-    const FILES: [&str; 6] =
-        ["database/a.jpg", "database/deep/b.jpg", "queries/1.jpg", "queries/2.jpg", "queries/3.jpg", "queries/4.jpg"];
+    const FILES: [&str; 6] = [
+        "database/a.jpg",
+        "database/deep/b.jpg",
+        "queries/1.jpg",
+        "queries/2.jpg",
+        "queries/3.jpg",
+        "queries/4.jpg",
+    ];
 
     #[test]
     fn pairs_no_match_and_unlabelled_are_told_apart() {
         // A byte-order mark, Windows line ends, a repeated pair, references out of order.
         let csv = b"\xef\xbb\xbfquery,reference\r\n1.jpg,deep/b.jpg\r\n1.jpg,a.jpg\r\n1.jpg,a.jpg\r\n2.jpg,\r\n4.jpg,a.jpg\r\n";
         let dataset = load(folder(&FILES, csv).path()).unwrap();
-        let expected = [Truth::Positives(vec![0, 1]), Truth::NoMatch, Truth::Unknown, Truth::Positives(vec![0])];
+        let expected = [
+            Truth::Positives(vec![0, 1]),
+            Truth::NoMatch,
+            Truth::Unknown,
+            Truth::Positives(vec![0]),
+        ];
         assert_eq!(dataset.truth, expected);
         assert_eq!(dataset.queries_with_match(), 2);
         assert_eq!(dataset.notes.len(), 1);
@@ -157,7 +221,16 @@ mod tests {
 
     #[test]
     fn an_empty_side_is_an_error() {
-        let root = folder(&["queries/1.jpg", "database/readme.txt"], b"query,reference\n");
-        assert!(matches!(load(root.path()), Err(EvalError::Empty { side: "database", .. })));
+        let root = folder(
+            &["queries/1.jpg", "database/readme.txt"],
+            b"query,reference\n",
+        );
+        assert!(matches!(
+            load(root.path()),
+            Err(EvalError::Empty {
+                side: "database",
+                ..
+            })
+        ));
     }
 }

@@ -1,9 +1,9 @@
 //! RobotCar Seasons v2: reference poses from the reconstruction, queries by condition and camera.
 //!
-//! `images/<condition>/<camera>/<timestamp>.jpg`; `3D-models/all-merged/all.nvm` holds the reference poses (rotation
-//! world to camera, and the camera's centre); `robotcar_v2_train.txt` names query images with a 4x4 camera-to-world
-//! matrix each; `robotcar_v2_test.txt` names those whose poses are withheld. Metadata say `.png` where the images
-//! are `.jpg`.
+//! `images/<condition>/<camera>/<timestamp>.jpg`; `3D-models/all-merged/all.nvm` holds the
+//! reference poses (rotation world to camera, and the camera's centre); `robotcar_v2_train.txt`
+//! names query images with a 4x4 camera-to-world matrix each; `robotcar_v2_test.txt` names those
+//! whose poses are withheld. Metadata say `.png` where the images are `.jpg`.
 
 use super::files::require;
 use super::neighbours::NeighbourGrid;
@@ -14,7 +14,8 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 const NAME: &str = "robotcar-seasons-v2";
-const EXPECTED: &str = "images/<condition>/<camera>, 3D-models/all-merged/all.nvm and robotcar_v2_{train,test}.txt";
+const EXPECTED: &str =
+    "images/<condition>/<camera>, 3D-models/all-merged/all.nvm and robotcar_v2_{train,test}.txt";
 
 /// Where a camera stood and how it was turned.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -28,7 +29,10 @@ pub struct Pose {
 impl Pose {
     /// Distance of the centres in metres and angle between the orientations in degrees.
     pub fn error(&self, other: &Self) -> (f64, f64) {
-        ((self.centre - other.centre).norm(), self.rotation.angle_to(&other.rotation).to_degrees())
+        (
+            (self.centre - other.centre).norm(),
+            self.rotation.angle_to(&other.rotation).to_degrees(),
+        )
     }
 
     /// Translation of the world-to-camera transform, as the benchmark wants it.
@@ -41,12 +45,19 @@ impl Pose {
 pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, EvalError> {
     let images = require(NAME, root.join("images"), EXPECTED)?;
     let queries = match options.split.unwrap_or(Split::Train) {
-        Split::Test => read_list(&require(NAME, root.join("robotcar_v2_test.txt"), EXPECTED)?, &images)?,
-        Split::Train | Split::Val => {
-            read_posed(&require(NAME, root.join("robotcar_v2_train.txt"), EXPECTED)?, &images)?
-        }
+        Split::Test => read_list(
+            &require(NAME, root.join("robotcar_v2_test.txt"), EXPECTED)?,
+            &images,
+        )?,
+        Split::Train | Split::Val => read_posed(
+            &require(NAME, root.join("robotcar_v2_train.txt"), EXPECTED)?,
+            &images,
+        )?,
     };
-    let cameras: BTreeSet<&str> = queries.iter().filter_map(|query| camera_of(&query.name)).collect();
+    let cameras: BTreeSet<&str> = queries
+        .iter()
+        .filter_map(|query| camera_of(&query.name))
+        .collect();
     let nvm = require(NAME, root.join("3D-models/all-merged/all.nvm"), EXPECTED)?;
     let all = read_nvm(&nvm, &images)?;
     let of_all = all.len();
@@ -54,9 +65,19 @@ pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, Eva
     let database: Vec<Item> = all.into_iter().filter(seen).collect();
     let truth = truth_by_pose(&database, &queries, options.radius_m);
     let cameras: Vec<&str> = cameras.into_iter().collect();
-    let notes =
-        vec![format!("{} of {of_all} references are of the queries' cameras ({})", database.len(), cameras.join(", "))];
-    Ok(Dataset { name: NAME.into(), database, queries: queries.clone(), truth, skipped: Vec::new(), notes })
+    let notes = vec![format!(
+        "{} of {of_all} references are of the queries' cameras ({})",
+        database.len(),
+        cameras.join(", ")
+    )];
+    Ok(Dataset {
+        name: NAME.into(),
+        database,
+        queries: queries.clone(),
+        truth,
+        skipped: Vec::new(),
+        notes,
+    })
 }
 
 fn camera_of(name: &str) -> Option<&str> {
@@ -64,13 +85,27 @@ fn camera_of(name: &str) -> Option<&str> {
 }
 
 fn truth_by_pose(database: &[Item], queries: &[Item], radius_m: f64) -> Vec<Truth> {
-    let flat = |pose: &Pose| MetricPoint { east: pose.centre.x, north: pose.centre.y };
-    let posed = database.iter().enumerate().filter_map(|(index, item)| Some((index, flat(item.pose.as_ref()?))));
+    let flat = |pose: &Pose| MetricPoint {
+        east: pose.centre.x,
+        north: pose.centre.y,
+    };
+    let posed = database
+        .iter()
+        .enumerate()
+        .filter_map(|(index, item)| Some((index, flat(item.pose.as_ref()?))));
     let grid = NeighbourGrid::new(radius_m, posed);
-    let near = |pose: &Pose, index: usize| database[index].pose.is_some_and(|other| pose.error(&other).0 <= radius_m);
+    let near = |pose: &Pose, index: usize| {
+        database[index]
+            .pose
+            .is_some_and(|other| pose.error(&other).0 <= radius_m)
+    };
     let truth_of = |query: &Item| match query.pose {
         None => Truth::Unknown,
-        Some(pose) => Truth::from_positives(grid.within(flat(&pose)).filter(|&index| near(&pose, index)).collect()),
+        Some(pose) => Truth::from_positives(
+            grid.within(flat(&pose))
+                .filter(|&index| near(&pose, index))
+                .collect(),
+        ),
     };
     queries.iter().map(truth_of).collect()
 }
@@ -78,14 +113,23 @@ fn truth_by_pose(database: &[Item], queries: &[Item], radius_m: f64) -> Vec<Trut
 /// An item for an image named as the metadata name it.
 fn item(images: &Path, name: &str, pose: Option<Pose>) -> Item {
     let name = name.trim_start_matches("./");
-    let name = name.strip_suffix(".png").map_or_else(|| name.to_owned(), |stem| format!("{stem}.jpg"));
+    let name = name
+        .strip_suffix(".png")
+        .map_or_else(|| name.to_owned(), |stem| format!("{stem}.jpg"));
     let group = name.split('/').next().map(str::to_owned);
-    Item { pose, group, ..Item::new(name.clone(), images.join(&name)) }
+    Item {
+        pose,
+        group,
+        ..Item::new(name.clone(), images.join(&name))
+    }
 }
 
-/// The lines of a text file that are not empty, with their 1-based numbers; Windows line ends do not matter.
+/// The lines of a text file that are not empty, with their 1-based numbers; Windows line ends do
+/// not matter.
 fn lines(text: &str) -> impl Iterator<Item = (u64, &str)> {
-    (1..).zip(text.lines().map(str::trim)).filter(|(_, line)| !line.is_empty())
+    (1..)
+        .zip(text.lines().map(str::trim))
+        .filter(|(_, line)| !line.is_empty())
 }
 
 fn read_text(path: &Path) -> Result<String, EvalError> {
@@ -93,10 +137,18 @@ fn read_text(path: &Path) -> Result<String, EvalError> {
 }
 
 fn wrong(path: &Path, line: u64, reason: impl Into<String>) -> EvalError {
-    EvalError::Record { path: path.to_owned(), line, reason: reason.into() }
+    EvalError::Record {
+        path: path.to_owned(),
+        line,
+        reason: reason.into(),
+    }
 }
 
-fn numbers<'a>(path: &Path, line: u64, fields: impl Iterator<Item = &'a str>) -> Result<Vec<f64>, EvalError> {
+fn numbers<'a>(
+    path: &Path,
+    line: u64,
+    fields: impl Iterator<Item = &'a str>,
+) -> Result<Vec<f64>, EvalError> {
     let parse = |field: &str| match field.parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),
         _ => Err(wrong(path, line, format!("{field:?} is not a number"))),
@@ -121,16 +173,34 @@ fn read_posed(path: &Path, images: &Path) -> Result<Vec<Item>, EvalError> {
         let name = fields.next().unwrap_or_default();
         let matrix = numbers(path, line, fields)?;
         if matrix.len() != 16 {
-            return Err(wrong(path, line, format!("{} numbers instead of the 16 of a 4x4 matrix", matrix.len())));
+            return Err(wrong(
+                path,
+                line,
+                format!("{} numbers instead of the 16 of a 4x4 matrix", matrix.len()),
+            ));
         }
         let row = |r: usize| [matrix[4 * r], matrix[4 * r + 1], matrix[4 * r + 2]];
         let rotation = Matrix3::from_row_slice(&[row(0), row(1), row(2)].concat());
-        if (rotation * rotation.transpose() - Matrix3::identity()).norm() > 1e-2 || rotation.determinant() < 0.0 {
-            return Err(wrong(path, line, "the upper left of the matrix is not a rotation"));
+        if (rotation * rotation.transpose() - Matrix3::identity()).norm() > 1e-2
+            || rotation.determinant() < 0.0
+        {
+            return Err(wrong(
+                path,
+                line,
+                "the upper left of the matrix is not a rotation",
+            ));
         }
-        let to_world = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+        let to_world =
+            UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
         let centre = Vector3::new(matrix[3], matrix[7], matrix[11]);
-        items.push(item(images, name, Some(Pose { rotation: to_world.inverse(), centre })));
+        items.push(item(
+            images,
+            name,
+            Some(Pose {
+                rotation: to_world.inverse(),
+                centre,
+            }),
+        ));
     }
     Ok(items)
 }
@@ -143,24 +213,43 @@ fn read_nvm(path: &Path, images: &Path) -> Result<Vec<Item>, EvalError> {
         Some((_, header)) if header.starts_with("NVM_V3") => {}
         _ => return Err(wrong(path, 1, "this is not an NVM_V3 file")),
     }
-    let (line, count) = lines.next().ok_or_else(|| wrong(path, 2, "the number of cameras is missing"))?;
-    let count: usize = count.parse().map_err(|_| wrong(path, line, format!("{count:?} is not a number of cameras")))?;
+    let (line, count) = lines
+        .next()
+        .ok_or_else(|| wrong(path, 2, "the number of cameras is missing"))?;
+    let count: usize = count
+        .parse()
+        .map_err(|_| wrong(path, line, format!("{count:?} is not a number of cameras")))?;
     let mut items = Vec::new();
     for (line, content) in lines.take(count) {
         let mut fields = content.split_whitespace();
         let name = fields.next().unwrap_or_default();
         let values = numbers(path, line, fields)?;
         let &[_, w, x, y, z, cx, cy, cz, ..] = values.as_slice() else {
-            return Err(wrong(path, line, "a camera needs a name, a focal length, a quaternion and a centre"));
+            return Err(wrong(
+                path,
+                line,
+                "a camera needs a name, a focal length, a quaternion and a centre",
+            ));
         };
         let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-9)
             .ok_or_else(|| wrong(path, line, "the quaternion is zero"))?;
-        items.push(item(images, name, Some(Pose { rotation, centre: Vector3::new(cx, cy, cz) })));
+        items.push(item(
+            images,
+            name,
+            Some(Pose {
+                rotation,
+                centre: Vector3::new(cx, cy, cz),
+            }),
+        ));
     }
     if items.len() == count {
         Ok(items)
     } else {
-        Err(wrong(path, line, format!("{count} cameras announced, {} found", items.len())))
+        Err(wrong(
+            path,
+            line,
+            format!("{count} cameras announced, {} found", items.len()),
+        ))
     }
 }
 
@@ -177,13 +266,19 @@ mod tests {
             std::fs::write(path, text).unwrap();
         };
         std::fs::create_dir_all(root.path().join("images")).unwrap();
-        write("3D-models/all-merged/all.nvm", &format!("NVM_V3 \r\n\r\n{count}\r\n{nvm_cameras}0\r\n"));
+        write(
+            "3D-models/all-merged/all.nvm",
+            &format!("NVM_V3 \r\n\r\n{count}\r\n{nvm_cameras}0\r\n"),
+        );
         // A quarter turn about z, 3 m from the first reference; one far away.
         write(
             "robotcar_v2_train.txt",
             "dawn/rear/11.png 0 -1 0 3 1 0 0 0 0 0 1 0 0 0 0 1\r\n\r\nnight/rear/12.jpg 1 0 0 900 0 1 0 0 0 0 1 0 0 0 0 1\r\n",
         );
-        write("robotcar_v2_test.txt", "rain/rear/21.jpg\nsnow/rear/22.jpg\n");
+        write(
+            "robotcar_v2_test.txt",
+            "rain/rear/21.jpg\nsnow/rear/22.jpg\n",
+        );
         root
     }
 
@@ -194,16 +289,38 @@ mod tests {
     #[test]
     fn poses_are_read_in_both_conventions() {
         let root = sample(CAMERAS, 3);
-        let dataset = load_dataset(DatasetKind::RobotcarSeasonsV2, root.path(), &DatasetOptions::default()).unwrap();
-        let names: Vec<_> = dataset.database.iter().map(|item| item.name.as_str()).collect();
+        let dataset = load_dataset(
+            DatasetKind::RobotcarSeasonsV2,
+            root.path(),
+            &DatasetOptions::default(),
+        )
+        .unwrap();
+        let names: Vec<_> = dataset
+            .database
+            .iter()
+            .map(|item| item.name.as_str())
+            .collect();
         // Only the queries' camera; .png became .jpg.
-        assert_eq!(names, ["overcast-reference/rear/1.jpg", "overcast-reference/rear/3.jpg"]);
+        assert_eq!(
+            names,
+            [
+                "overcast-reference/rear/1.jpg",
+                "overcast-reference/rear/3.jpg"
+            ]
+        );
         let query = dataset.queries[0].pose.unwrap();
         let (metres, degrees) = query.error(&dataset.database[0].pose.unwrap());
-        assert!((metres - 3.0).abs() < 1e-9 && (degrees - 90.0).abs() < 1e-6, "{metres} {degrees}");
-        // Camera-to-world turned by +90 degrees about z is world-to-camera turned by -90: the third reference.
+        assert!(
+            (metres - 3.0).abs() < 1e-9 && (degrees - 90.0).abs() < 1e-6,
+            "{metres} {degrees}"
+        );
+        // Camera-to-world turned by +90 degrees about z is world-to-camera turned by -90: the third
+        // reference.
         let (metres, degrees) = query.error(&dataset.database[1].pose.unwrap());
-        assert!((metres - 30.0).abs() < 1e-9 && degrees < 1e-6, "{metres} {degrees}");
+        assert!(
+            (metres - 30.0).abs() < 1e-9 && degrees < 1e-6,
+            "{metres} {degrees}"
+        );
         // 30 m up is beyond the radius though right above on the plan.
         assert_eq!(dataset.truth, [Truth::Positives(vec![0]), Truth::NoMatch]);
         assert_eq!(dataset.queries[1].group.as_deref(), Some("night"));
@@ -212,7 +329,10 @@ mod tests {
     #[test]
     fn the_test_split_has_no_poses() {
         let root = sample(CAMERAS, 3);
-        let options = DatasetOptions { split: Some(Split::Test), ..Default::default() };
+        let options = DatasetOptions {
+            split: Some(Split::Test),
+            ..Default::default()
+        };
         let dataset = load_dataset(DatasetKind::RobotcarSeasonsV2, root.path(), &options).unwrap();
         assert_eq!(dataset.truth, [Truth::Unknown, Truth::Unknown]);
     }
@@ -220,15 +340,26 @@ mod tests {
     #[test]
     fn damaged_metadata_are_named_with_their_line() {
         let load = |root: &tempfile::TempDir| {
-            load_dataset(DatasetKind::RobotcarSeasonsV2, root.path(), &DatasetOptions::default())
-                .unwrap_err()
-                .to_string()
+            load_dataset(
+                DatasetKind::RobotcarSeasonsV2,
+                root.path(),
+                &DatasetOptions::default(),
+            )
+            .unwrap_err()
+            .to_string()
         };
         assert!(load(&sample(CAMERAS, 4)).contains("line 7: a camera needs"));
         assert!(load(&sample("", 0)).contains("no usable database image"));
-        assert!(load(&sample("a/rear/1.png 400 0 0 0 0 0 0 0 0 0\n", 1)).contains("line 4: the quaternion is zero"));
+        assert!(
+            load(&sample("a/rear/1.png 400 0 0 0 0 0 0 0 0 0\n", 1))
+                .contains("line 4: the quaternion is zero")
+        );
         let root = sample(CAMERAS, 3);
-        std::fs::write(root.path().join("robotcar_v2_train.txt"), "a/rear/1.png 1 2 3\n").unwrap();
+        std::fs::write(
+            root.path().join("robotcar_v2_train.txt"),
+            "a/rear/1.png 1 2 3\n",
+        )
+        .unwrap();
         assert!(load(&root).contains("line 1: 3 numbers"));
     }
 }

@@ -1,4 +1,5 @@
-//! CSV files of the data sets: columns by name, errors by line, Windows line ends and byte-order marks tolerated.
+//! CSV files of the data sets: columns by name, errors by line, Windows line ends and byte-order
+//! marks tolerated.
 
 use crate::eval::EvalError;
 use std::path::{Path, PathBuf};
@@ -19,15 +20,29 @@ impl Table {
     pub(super) fn read(path: &Path) -> Result<Self, EvalError> {
         let bytes = std::fs::read(path).map_err(EvalError::io(path))?;
         let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
-        let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(bytes);
+        let mut reader = csv::ReaderBuilder::new()
+            .trim(csv::Trim::All)
+            .from_reader(bytes);
         let record_error = |error: csv::Error| EvalError::Record {
             path: path.to_owned(),
             line: error.position().map_or(1, csv::Position::line),
             reason: error.to_string(),
         };
-        let headers = reader.headers().map_err(record_error)?.iter().map(str::to_owned).collect();
-        let rows = reader.records().collect::<Result<_, _>>().map_err(record_error)?;
-        Ok(Self { path: path.to_owned(), headers, rows })
+        let headers = reader
+            .headers()
+            .map_err(record_error)?
+            .iter()
+            .map(str::to_owned)
+            .collect();
+        let rows = reader
+            .records()
+            .collect::<Result<_, _>>()
+            .map_err(record_error)?;
+        Ok(Self {
+            path: path.to_owned(),
+            headers,
+            rows,
+        })
     }
 
     /// The column called `name`.
@@ -35,18 +50,27 @@ impl Table {
         self.optional_column(name).ok_or_else(|| EvalError::Record {
             path: self.path.clone(),
             line: 1,
-            reason: format!("there is no column {name:?}; the columns are {}", self.headers.join(", ")),
+            reason: format!(
+                "there is no column {name:?}; the columns are {}",
+                self.headers.join(", ")
+            ),
         })
     }
 
     /// The column called `name`, if there is one.
     pub(super) fn optional_column(&self, name: &str) -> Option<Column> {
-        self.headers.iter().position(|header| header == name).map(Column)
+        self.headers
+            .iter()
+            .position(|header| header == name)
+            .map(Column)
     }
 
     /// All rows in the order of the file.
     pub(super) fn rows(&self) -> impl Iterator<Item = Row<'_>> {
-        self.rows.iter().map(|record| Row { table: self, record })
+        self.rows.iter().map(|record| Row {
+            table: self,
+            record,
+        })
     }
 }
 
@@ -68,7 +92,10 @@ impl<'t> Row<'t> {
         let text = self.text(column);
         match text.parse::<f64>() {
             Ok(value) if value.is_finite() => Ok(value),
-            _ => Err(self.error(format!("{} {text:?} is not a number", self.table.headers[column.0]))),
+            _ => Err(self.error(format!(
+                "{} {text:?} is not a number",
+                self.table.headers[column.0]
+            ))),
         }
     }
 
@@ -77,13 +104,20 @@ impl<'t> Row<'t> {
         match self.text(column).to_ascii_lowercase().as_str() {
             "true" | "1" => Ok(true),
             "false" | "0" => Ok(false),
-            other => Err(self.error(format!("{} {other:?} is neither true nor false", self.table.headers[column.0]))),
+            other => Err(self.error(format!(
+                "{} {other:?} is neither true nor false",
+                self.table.headers[column.0]
+            ))),
         }
     }
 
     /// An error that names this row.
     pub(super) fn error(self, reason: String) -> EvalError {
         let line = self.record.position().map_or(1, csv::Position::line);
-        EvalError::Record { path: self.table.path.clone(), line, reason }
+        EvalError::Record {
+            path: self.table.path.clone(),
+            line,
+            reason,
+        }
     }
 }

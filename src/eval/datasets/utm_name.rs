@@ -1,5 +1,6 @@
-//! Names that carry their own metadata: `@utm_east@utm_north@zone@band@lat@lon@pano@tile@heading@pitch@roll@height@
-//! time@note@.jpg`, the convention of the common visual place recognition benchmarks.
+//! Names that carry their own metadata:
+//! `@utm_east@utm_north@zone@band@lat@lon@pano@tile@heading@pitch@roll@height@ time@note@.jpg`, the
+//! convention of the common visual place recognition benchmarks.
 //!
 //! Only the first two fields must be there; the rest may be empty or absent.
 
@@ -21,7 +22,12 @@ impl std::str::FromStr for UtmZone {
 
     /// Parses `33T`.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let wrong = || InvalidValue::new("utm_zone", format!("{text:?} is not a zone and band such as 33T"));
+        let wrong = || {
+            InvalidValue::new(
+                "utm_zone",
+                format!("{text:?} is not a zone and band such as 33T"),
+            )
+        };
         let (split, band) = text.char_indices().next_back().ok_or_else(wrong)?;
         Self::new(&text[..split], &band.to_string()).ok_or_else(wrong)
     }
@@ -37,7 +43,10 @@ impl UtmZone {
     /// The zone a position lies in; none beyond 80 degrees south and 84 north.
     pub fn of(position: GeoPoint) -> Option<Self> {
         let band = utm::lat_to_zone_letter(position.lat())?;
-        Some(Self { number: utm::lat_lon_to_zone_number(position.lat(), position.lon()), band })
+        Some(Self {
+            number: utm::lat_lon_to_zone_number(position.lat(), position.lon()),
+            band,
+        })
     }
 
     /// The position of grid coordinates in this zone.
@@ -47,16 +56,21 @@ impl UtmZone {
             GeoPoint::new(lat, lon).ok()
         };
         let near = inverse(point.east, point.north)?;
-        // The library's inverse is off by up to 0.6 m at the edge of a zone, where neighbours of two zones meet. Its
-        // forward direction is exact, so one step back from where that lands leaves less than a millimetre.
+        // The library's inverse is off by up to 0.6 m at the edge of a zone, where neighbours of
+        // two zones meet. Its forward direction is exact, so one step back from where that lands
+        // leaves less than a millimetre.
         let landed = self.from_geo(near);
-        let (east, north) = (2.0 * point.east - landed.east, 2.0 * point.north - landed.north);
+        let (east, north) = (
+            2.0 * point.east - landed.east,
+            2.0 * point.north - landed.north,
+        );
         Some(inverse(east, north).unwrap_or(near))
     }
 
     /// The grid coordinates of a position, continued into this zone wherever it lies.
     pub fn from_geo(self, position: GeoPoint) -> MetricPoint {
-        // Measured from the zone's own meridian, so that the date line does not tear neighbours apart.
+        // Measured from the zone's own meridian, so that the date line does not tear neighbours
+        // apart.
         let meridian = f64::from(self.number) * 6.0 - 183.0;
         let lon = meridian + (position.lon() - meridian + 180.0).rem_euclid(360.0) - 180.0;
         let (north, east, _) = utm::to_utm_wgs84(position.lat(), lon, self.number);
@@ -86,14 +100,22 @@ impl UtmName {
     pub fn parse(name: &str) -> Result<Self, InvalidValue> {
         let file = name.rsplit('/').next().unwrap_or(name);
         let wrong = |what: &str| InvalidValue::new("name", format!("{file:?} {what}"));
-        let stem = file.rsplit_once('.').filter(|(_, end)| is_extension(end)).map_or(file, |(stem, _)| stem);
+        let stem = file
+            .rsplit_once('.')
+            .filter(|(_, end)| is_extension(end))
+            .map_or(file, |(stem, _)| stem);
         let mut fields = stem.split('@');
         if fields.next() != Some("") {
             return Err(wrong("does not start with @"));
         }
         let fields: Vec<&str> = fields.map(str::trim).collect();
         let field = |index: usize| fields.get(index).copied().unwrap_or("");
-        let metres = |index: usize| field(index).parse::<f64>().ok().filter(|value| value.is_finite());
+        let metres = |index: usize| {
+            field(index)
+                .parse::<f64>()
+                .ok()
+                .filter(|value| value.is_finite())
+        };
         let (Some(east), Some(north)) = (metres(0), metres(1)) else {
             return Err(wrong("does not begin with @utm_east@utm_north@"));
         };
@@ -101,22 +123,29 @@ impl UtmName {
         Ok(Self {
             point: MetricPoint { east, north },
             zone: UtmZone::new(field(2), field(3)),
-            geo: degrees(4).zip(degrees(5)).and_then(|(lat, lon)| GeoPoint::new(lat, lon).ok()),
+            geo: degrees(4)
+                .zip(degrees(5))
+                .and_then(|(lat, lon)| GeoPoint::new(lat, lon).ok()),
             pano_id: field(6).to_owned(),
             heading: degrees(8).and_then(|angle| Heading::new(angle).ok()),
             captured_at: parse_time(field(12)),
         })
     }
 
-    /// The position on the Earth: from the grid coordinates and the zone in the name, else in `fallback`, else from
-    /// the latitude and longitude in the name (which carry fewer digits).
+    /// The position on the Earth: from the grid coordinates and the zone in the name, else in
+    /// `fallback`, else from the latitude and longitude in the name (which carry fewer digits).
     pub fn location(&self, fallback: Option<UtmZone>) -> Option<GeoPoint> {
-        self.zone.or(fallback).and_then(|zone| zone.to_geo(self.point)).or(self.geo)
+        self.zone
+            .or(fallback)
+            .and_then(|zone| zone.to_geo(self.point))
+            .or(self.geo)
     }
 }
 
 fn is_extension(text: &str) -> bool {
-    !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric()) && text.chars().any(|c| c.is_ascii_alphabetic())
+    !text.is_empty()
+        && text.chars().all(|c| c.is_ascii_alphanumeric())
+        && text.chars().any(|c| c.is_ascii_alphabetic())
 }
 
 /// `YYYYMMDD_hhmmss`, everything from the right optional; what is missing counts as the beginning.
@@ -129,7 +158,11 @@ fn parse_time(text: &str) -> Option<OffsetDateTime> {
     let year = day_part.get(..4)?.parse().ok()?;
     let month = Month::try_from(digits(day_part, 4..6, 1)?).ok()?;
     let date = Date::from_calendar_date(year, month, digits(day_part, 6..8, 1)?).ok()?;
-    let time = Time::from_hms(digits(time_part, 0..2, 0)?, digits(time_part, 2..4, 0)?, digits(time_part, 4..6, 0)?);
+    let time = Time::from_hms(
+        digits(time_part, 0..2, 0)?,
+        digits(time_part, 2..4, 0)?,
+        digits(time_part, 4..6, 0)?,
+    );
     Some(PrimitiveDateTime::new(date, time.ok()?).assume_utc())
 }
 
@@ -140,23 +173,59 @@ mod tests {
 
     #[test]
     fn a_full_name_gives_every_field() {
-        let name = "db/@0584300.51@4475420.32@17@T@040.42412@-080.00610@pano-1@03@090@@@@201311@note@.jpg";
+        let name =
+            "db/@0584300.51@4475420.32@17@T@040.42412@-080.00610@pano-1@03@090@@@@201311@note@.jpg";
         let parsed = UtmName::parse(name).unwrap();
-        assert_eq!(parsed.point, MetricPoint { east: 584_300.51, north: 4_475_420.32 });
-        assert_eq!(parsed.zone, Some(UtmZone { number: 17, band: 'T' }));
-        assert_eq!((parsed.pano_id.as_str(), parsed.heading.unwrap().degrees()), ("pano-1", 90.0));
+        assert_eq!(
+            parsed.point,
+            MetricPoint {
+                east: 584_300.51,
+                north: 4_475_420.32
+            }
+        );
+        assert_eq!(
+            parsed.zone,
+            Some(UtmZone {
+                number: 17,
+                band: 'T'
+            })
+        );
+        assert_eq!(
+            (parsed.pano_id.as_str(), parsed.heading.unwrap().degrees()),
+            ("pano-1", 90.0)
+        );
         assert_eq!(parsed.captured_at, Some(datetime!(2013-11-01 0:00 UTC)));
         let geo = parsed.location(None).unwrap();
-        assert!(geo.distance_m(GeoPoint::new(40.42412, -80.00610).unwrap()) < 2_000.0, "{geo:?}");
+        assert!(
+            geo.distance_m(GeoPoint::new(40.42412, -80.00610).unwrap()) < 2_000.0,
+            "{geo:?}"
+        );
     }
 
     #[test]
     fn short_names_do_and_others_are_refused() {
         let parsed = UtmName::parse("@12.5@-3@.jpg").unwrap();
-        assert_eq!((parsed.point, parsed.zone), (MetricPoint { east: 12.5, north: -3.0 }, None));
+        assert_eq!(
+            (parsed.point, parsed.zone),
+            (
+                MetricPoint {
+                    east: 12.5,
+                    north: -3.0
+                },
+                None
+            )
+        );
         assert_eq!(UtmName::parse("@1@2.5.jpg").unwrap().point.north, 2.5);
         assert_eq!(UtmName::parse("@1@2.5").unwrap().point.north, 2.5);
-        for bad in ["", "img.jpg", "@.jpg", "@a@b@.jpg", "@1@@.jpg", "@NaN@1@.jpg", "x@1@2@.jpg"] {
+        for bad in [
+            "",
+            "img.jpg",
+            "@.jpg",
+            "@a@b@.jpg",
+            "@1@@.jpg",
+            "@NaN@1@.jpg",
+            "x@1@2@.jpg",
+        ] {
             assert!(UtmName::parse(bad).is_err(), "{bad}");
         }
     }
@@ -177,7 +246,10 @@ mod tests {
 
     #[test]
     fn times_may_stop_anywhere() {
-        assert_eq!(parse_time("20190102_030405"), Some(datetime!(2019-01-02 3:04:05 UTC)));
+        assert_eq!(
+            parse_time("20190102_030405"),
+            Some(datetime!(2019-01-02 3:04:05 UTC))
+        );
         assert_eq!(parse_time("2019"), Some(datetime!(2019-01-01 0:00 UTC)));
         assert_eq!(parse_time("201913"), None);
         assert_eq!(parse_time(""), None);

@@ -1,15 +1,17 @@
 //! Which UTM zones can share one plane.
 //!
-//! Coordinates of different zones are not comparable, and a zone cannot be continued across the globe: seen from
-//! San Francisco's zone, 20 m in Copenhagen become 80 to 100 m. So only zones that touch are projected into one, in
-//! clusters of at most three, so that a point is never carried farther than into the neighbouring zone. Clusters are
-//! told apart by the group of their images; images of different groups are never compared.
+//! Coordinates of different zones are not comparable, and a zone cannot be continued across the
+//! globe: seen from San Francisco's zone, 20 m in Copenhagen become 80 to 100 m. So only zones that
+//! touch are projected into one, in clusters of at most three, so that a point is never carried
+//! farther than into the neighbouring zone. Clusters are told apart by the group of their images;
+//! images of different groups are never compared.
 
 use super::{MetricPoint, UtmZone};
 use crate::types::GeoPoint;
 use std::collections::BTreeSet;
 
-/// Zones of a cluster: into the middle one, a neighbour on either side can be continued (at most 1.3% too long).
+/// Zones of a cluster: into the middle one, a neighbour on either side can be continued (at most
+/// 1.3% too long).
 const WIDTH: usize = 3;
 const ZONES: u8 = 60;
 
@@ -27,26 +29,47 @@ struct Cluster {
 impl Zones {
     /// Clusters of all zones that occur.
     pub(super) fn of(zones: impl IntoIterator<Item = UtmZone>) -> Self {
-        let grids: BTreeSet<(bool, u8)> = zones.into_iter().map(|zone| (is_north(zone), zone.number)).collect();
+        let grids: BTreeSet<(bool, u8)> = zones
+            .into_iter()
+            .map(|zone| (is_north(zone), zone.number))
+            .collect();
         let clusters = [false, true].into_iter().flat_map(|north| {
-            let numbers: Vec<u8> = grids.iter().filter(|grid| grid.0 == north).map(|grid| grid.1).collect();
+            let numbers: Vec<u8> = grids
+                .iter()
+                .filter(|grid| grid.0 == north)
+                .map(|grid| grid.1)
+                .collect();
             runs(numbers).into_iter().flat_map(move |run| {
-                run.chunks(WIDTH).map(|numbers| Cluster { north, numbers: numbers.to_vec() }).collect::<Vec<_>>()
+                run.chunks(WIDTH)
+                    .map(|numbers| Cluster {
+                        north,
+                        numbers: numbers.to_vec(),
+                    })
+                    .collect::<Vec<_>>()
             })
         });
         Self(clusters.collect())
     }
 
-    /// Where a point of `zone` lies in its cluster's plane; none where the point is outside its own grid.
+    /// Where a point of `zone` lies in its cluster's plane; none where the point is outside its own
+    /// grid.
     pub(super) fn project(&self, zone: UtmZone, point: MetricPoint) -> Option<MetricPoint> {
         let target = self.cluster(zone)?.target();
         // What needs no projection keeps every digit it was given with.
-        if target.number == zone.number { Some(point) } else { Some(target.from_geo(zone.to_geo(point)?)) }
+        if target.number == zone.number {
+            Some(point)
+        } else {
+            Some(target.from_geo(zone.to_geo(point)?))
+        }
     }
 
     /// The group of an image of `zone`: its cluster, if there is more than one.
     pub(super) fn group(&self, zone: UtmZone) -> Option<String> {
-        if self.0.len() > 1 { Some(self.cluster(zone)?.name()) } else { None }
+        if self.0.len() > 1 {
+            Some(self.cluster(zone)?.name())
+        } else {
+            None
+        }
     }
 
     /// The plane coordinates of a position of `zone` in its cluster.
@@ -72,20 +95,28 @@ impl Zones {
             .collect();
         if self.are_apart() {
             let names: Vec<String> = self.0.iter().map(Cluster::name).collect();
-            notes.push(format!("images of different regions are never positives: {}", names.join(", ")));
+            notes.push(format!(
+                "images of different regions are never positives: {}",
+                names.join(", ")
+            ));
         }
         notes
     }
 
     fn cluster(&self, zone: UtmZone) -> Option<&Cluster> {
-        self.0.iter().find(|cluster| cluster.north == is_north(zone) && cluster.numbers.contains(&zone.number))
+        self.0.iter().find(|cluster| {
+            cluster.north == is_north(zone) && cluster.numbers.contains(&zone.number)
+        })
     }
 }
 
 impl Cluster {
     fn target(&self) -> UtmZone {
         let band = if self.north { 'N' } else { 'M' };
-        UtmZone { number: self.numbers[self.numbers.len() / 2], band }
+        UtmZone {
+            number: self.numbers[self.numbers.len() / 2],
+            band,
+        }
     }
 
     fn name(&self) -> String {
@@ -108,7 +139,10 @@ fn runs(mut numbers: Vec<u8>) -> Vec<Vec<u8>> {
     if let Some(start) = numbers.iter().position(starts_a_run) {
         numbers.rotate_left(start);
     }
-    numbers.chunk_by(|&west, &east| after(west) == east).map(<[u8]>::to_vec).collect()
+    numbers
+        .chunk_by(|&west, &east| after(west) == east)
+        .map(<[u8]>::to_vec)
+        .collect()
 }
 
 #[cfg(test)]
@@ -143,7 +177,10 @@ mod tests {
         let one = Zones::of([zone("31U"), zone("32U")]);
         assert_eq!((one.group(zone("31U")), one.notes().len()), (None, 1));
         let long = Zones::of(["29T", "30T", "31T", "32T"].map(zone));
-        assert_eq!(long.group(zone("30T")).as_deref(), Some("zones 29-31 north"));
+        assert_eq!(
+            long.group(zone("30T")).as_deref(),
+            Some("zones 29-31 north")
+        );
         assert_eq!(long.group(zone("32T")).as_deref(), Some("zone 32 north"));
     }
 
@@ -152,7 +189,9 @@ mod tests {
         let zones = Zones::of([zone("60K"), zone("1K")]);
         let place = |text: &str, lon: f64| {
             let zone = zone(text);
-            zones.project(zone, zone.from_geo(GeoPoint::new(-18.0, lon).unwrap())).unwrap()
+            zones
+                .project(zone, zone.from_geo(GeoPoint::new(-18.0, lon).unwrap()))
+                .unwrap()
         };
         let (west, east) = (place("60K", 179.9999), place("1K", -179.9999));
         let metres = (west.east - east.east).hypot(west.north - east.north);

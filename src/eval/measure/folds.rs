@@ -6,8 +6,8 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
 
-/// The fold of every answer, below `folds` (at least 2). Answers of one place share theirs; right and wrong answers are
-/// spread evenly.
+/// The fold of every answer, below `folds` (at least 2). Answers of one place share theirs; right
+/// and wrong answers are spread evenly.
 pub(super) fn folds_of(answers: &[TopOne], folds: usize, seed: u64) -> Vec<usize> {
     let mut counts: BTreeMap<usize, [usize; 2]> = BTreeMap::new();
     for answer in answers {
@@ -21,13 +21,17 @@ pub(super) fn folds_of(answers: &[TopOne], folds: usize, seed: u64) -> Vec<usize
     let mut fold_of = BTreeMap::new();
     for (place, [wrong, right]) in places {
         let alike = |load: &[usize; 2]| wrong * load[0] + right * load[1];
-        let fold = (0..loads.len()).min_by_key(|&fold| (alike(&loads[fold]), loads[fold].iter().sum::<usize>()));
+        let fold = (0..loads.len())
+            .min_by_key(|&fold| (alike(&loads[fold]), loads[fold].iter().sum::<usize>()));
         let fold = fold.unwrap_or(0);
         loads[fold][0] += wrong;
         loads[fold][1] += right;
         fold_of.insert(place, fold);
     }
-    answers.iter().map(|answer| fold_of.get(&answer.place).copied().unwrap_or(0)).collect()
+    answers
+        .iter()
+        .map(|answer| fold_of.get(&answer.place).copied().unwrap_or(0))
+        .collect()
 }
 
 #[cfg(test)]

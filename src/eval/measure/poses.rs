@@ -17,7 +17,8 @@ pub struct PoseAccuracy {
     pub percent: f64,
 }
 
-/// Pairs each query's pose with that of its best match (absent if nothing was found); both limits are inclusive.
+/// Pairs each query's pose with that of its best match (absent if nothing was found); both limits
+/// are inclusive.
 pub fn pose_accuracy(pairs: &[(Pose, Option<Pose>)]) -> [PoseAccuracy; 3] {
     POSE_THRESHOLDS.map(|(metres, degrees)| {
         let within = |(query, best): &&(Pose, Option<Pose>)| {
@@ -27,8 +28,16 @@ pub fn pose_accuracy(pairs: &[(Pose, Option<Pose>)]) -> [PoseAccuracy; 3] {
             })
         };
         let near = pairs.iter().filter(within).count();
-        let percent = if pairs.is_empty() { 0.0 } else { 100.0 * near as f64 / pairs.len() as f64 };
-        PoseAccuracy { metres, degrees, percent }
+        let percent = if pairs.is_empty() {
+            0.0
+        } else {
+            100.0 * near as f64 / pairs.len() as f64
+        };
+        PoseAccuracy {
+            metres,
+            degrees,
+            percent,
+        }
     })
 }
 
@@ -39,7 +48,10 @@ mod tests {
 
     fn pose(x: f64, degrees: f64) -> Pose {
         let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), degrees.to_radians());
-        Pose { rotation, centre: Vector3::new(x, 0.0, 0.0) }
+        Pose {
+            rotation,
+            centre: Vector3::new(x, 0.0, 0.0),
+        }
     }
 
     #[test]
@@ -52,7 +64,10 @@ mod tests {
             (query, Some(pose(0.1, 90.0))),
             (query, None),
         ];
-        assert_eq!(pose_accuracy(&pairs).map(|accuracy| accuracy.percent), [20.0, 40.0, 60.0]);
+        assert_eq!(
+            pose_accuracy(&pairs).map(|accuracy| accuracy.percent),
+            [20.0, 40.0, 60.0]
+        );
         assert_eq!(pose_accuracy(&[])[0].percent, 0.0);
     }
 }

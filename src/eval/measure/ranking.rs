@@ -18,22 +18,39 @@ pub struct Interval {
 
 /// The 0-based rank of the first positive.
 pub fn first_hit(ranking: &[usize], positives: &[usize]) -> Option<usize> {
-    ranking.iter().position(|index| positives.binary_search(index).is_ok())
+    ranking
+        .iter()
+        .position(|index| positives.binary_search(index).is_ok())
 }
 
-/// Percentage of queries whose first positive is among the top k; `first_hits` holds one entry per query that has a
-/// match. `None` if there is no such query.
+/// Percentage of queries whose first positive is among the top k; `first_hits` holds one entry per
+/// query that has a match. `None` if there is no such query.
 pub fn recall_at(first_hits: &[Option<usize>], k: usize) -> Option<f64> {
-    let found = first_hits.iter().flatten().filter(|&&rank| rank < k).count();
+    let found = first_hits
+        .iter()
+        .flatten()
+        .filter(|&&rank| rank < k)
+        .count();
     (!first_hits.is_empty()).then(|| 100.0 * found as f64 / first_hits.len() as f64)
 }
 
-/// 95% percentile intervals of [`recall_at`] for every k, from `resamples` draws of as many queries with replacement.
-/// The same seed gives the same interval.
-pub fn bootstrap_recall(first_hits: &[Option<usize>], ks: &[usize], resamples: usize, seed: u64) -> Vec<Interval> {
+/// 95% percentile intervals of [`recall_at`] for every k, from `resamples` draws of as many queries
+/// with replacement. The same seed gives the same interval.
+pub fn bootstrap_recall(
+    first_hits: &[Option<usize>],
+    ks: &[usize],
+    resamples: usize,
+    seed: u64,
+) -> Vec<Interval> {
     let n = first_hits.len();
     if n == 0 || resamples == 0 {
-        return vec![Interval { low: 0.0, high: 100.0 }; ks.len()];
+        return vec![
+            Interval {
+                low: 0.0,
+                high: 100.0
+            };
+            ks.len()
+        ];
     }
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut samples = vec![Vec::with_capacity(resamples); ks.len()];
@@ -56,11 +73,15 @@ pub fn bootstrap_recall(first_hits: &[Option<usize>], ks: &[usize], resamples: u
 fn interval(mut sample: Vec<f64>) -> Interval {
     sample.sort_unstable_by(f64::total_cmp);
     let at = |share: f64| sample[((sample.len() - 1) as f64 * share).round() as usize];
-    Interval { low: at(0.025), high: at(0.975) }
+    Interval {
+        low: at(0.025),
+        high: at(0.975),
+    }
 }
 
-/// Average precision of the first `k` answers, 0 to 1: the mean, over the hits, of the precision at their rank,
-/// divided by the number of hits that were possible (as the MSLS evaluation defines it).
+/// Average precision of the first `k` answers, 0 to 1: the mean, over the hits, of the precision at
+/// their rank, divided by the number of hits that were possible (as the MSLS evaluation defines
+/// it).
 pub fn average_precision(ranking: &[usize], positives: &[usize], k: usize) -> f64 {
     let possible = positives.len().min(k);
     if possible == 0 {
@@ -85,7 +106,10 @@ mod tests {
     #[test]
     fn recall_by_hand() {
         let hits = [Some(0), Some(4), Some(5), None];
-        assert_eq!([1, 5, 6, 20].map(|k| recall_at(&hits, k).unwrap()), [25.0, 50.0, 75.0, 75.0]);
+        assert_eq!(
+            [1, 5, 6, 20].map(|k| recall_at(&hits, k).unwrap()),
+            [25.0, 50.0, 75.0, 75.0]
+        );
         assert_eq!(recall_at(&[], 1), None);
         assert_eq!(first_hit(&[9, 4, 2], &[2, 4]), Some(1));
         assert_eq!(first_hit(&[9], &[2, 4]), None);
@@ -98,7 +122,11 @@ mod tests {
         // Only one of two positives can be found at k = 1.
         assert_eq!(average_precision(&[7, 1, 8], &[7, 8], 1), 1.0);
         // The example in the MSLS evaluation: positives on ranks 4 and 2.
-        assert!((average_precision(&[0, 1, 2, 3, 4, 5], &[4, 5], 6) - (1.0 / 5.0 + 2.0 / 6.0) / 2.0).abs() < 1e-12);
+        assert!(
+            (average_precision(&[0, 1, 2, 3, 4, 5], &[4, 5], 6) - (1.0 / 5.0 + 2.0 / 6.0) / 2.0)
+                .abs()
+                < 1e-12
+        );
         assert_eq!(average_precision(&[1], &[], 5), 0.0);
     }
 
@@ -107,9 +135,18 @@ mod tests {
         // 400 queries at 50%: the standard error is 2.5 points.
         let hits: Vec<_> = (0..400).map(|i| (i % 2 == 0).then_some(0)).collect();
         let Interval { low, high } = bootstrap_recall(&hits, &[1], 2000, 7)[0];
-        assert!((low - 45.1).abs() < 1.0 && (high - 54.9).abs() < 1.0, "{low} {high}");
+        assert!(
+            (low - 45.1).abs() < 1.0 && (high - 54.9).abs() < 1.0,
+            "{low} {high}"
+        );
         let all = vec![Some(0); 10];
-        assert_eq!(bootstrap_recall(&all, &[1], 100, 7)[0], Interval { low: 100.0, high: 100.0 });
+        assert_eq!(
+            bootstrap_recall(&all, &[1], 100, 7)[0],
+            Interval {
+                low: 100.0,
+                high: 100.0
+            }
+        );
     }
 
     fn hits() -> impl Strategy<Value = Vec<Option<usize>>> {

@@ -1,7 +1,8 @@
 //! Rejecting unknown places: how far can an answer's score be trusted?
 //!
-//! An answer is accepted if its score reaches a threshold. Accepted and right counts for precision; a wrong place, or
-//! any place where none exists, counts against it. Recall is over the queries that have a match.
+//! An answer is accepted if its score reaches a threshold. Accepted and right counts for precision;
+//! a wrong place, or any place where none exists, counts against it. Recall is over the queries
+//! that have a match.
 
 use serde::Serialize;
 
@@ -54,11 +55,18 @@ pub fn rejection(answers: &[Judged]) -> Rejection {
         curve.push(PrecisionRecall {
             threshold: same[0].score,
             precision: 100.0 * correct as f64 / accepted as f64,
-            recall: if with_match == 0 { 0.0 } else { 100.0 * correct as f64 / with_match as f64 },
+            recall: if with_match == 0 {
+                0.0
+            } else {
+                100.0 * correct as f64 / with_match as f64
+            },
         });
     }
     // Precision is whole only until the first wrong answer; the last such threshold accepts most.
-    let sure = curve.iter().take_while(|point| point.precision >= 100.0).last();
+    let sure = curve
+        .iter()
+        .take_while(|point| point.precision >= 100.0)
+        .last();
     let mut average_precision = 0.0;
     let mut recall_before = 0.0;
     for point in &curve {
@@ -80,7 +88,11 @@ mod tests {
     use proptest::prelude::*;
 
     fn judged(score: f64, correct: bool, has_match: bool) -> Judged {
-        Judged { score, correct, has_match }
+        Judged {
+            score,
+            correct,
+            has_match,
+        }
     }
 
     #[test]
@@ -93,18 +105,47 @@ mod tests {
             judged(5.0, false, true),
         ];
         let result = rejection(&answers);
-        assert_eq!((result.recall_at_full_precision, result.full_precision_threshold), (50.0, Some(8.0)));
-        let points: Vec<_> = result.curve.iter().map(|p| (p.precision.round(), p.recall)).collect();
-        assert_eq!(points, [(100.0, 25.0), (100.0, 50.0), (67.0, 50.0), (75.0, 75.0), (60.0, 75.0)]);
+        assert_eq!(
+            (
+                result.recall_at_full_precision,
+                result.full_precision_threshold
+            ),
+            (50.0, Some(8.0))
+        );
+        let points: Vec<_> = result
+            .curve
+            .iter()
+            .map(|p| (p.precision.round(), p.recall))
+            .collect();
+        assert_eq!(
+            points,
+            [
+                (100.0, 25.0),
+                (100.0, 50.0),
+                (67.0, 50.0),
+                (75.0, 75.0),
+                (60.0, 75.0)
+            ]
+        );
         assert!((result.average_precision - (0.25 + 0.25 + 0.25 * 0.75)).abs() < 1e-12);
         assert_eq!(result.without_match, 1);
     }
 
     #[test]
     fn equal_scores_stand_or_fall_together() {
-        let answers = [judged(3.0, true, true), judged(3.0, false, false), judged(1.0, true, true)];
+        let answers = [
+            judged(3.0, true, true),
+            judged(3.0, false, false),
+            judged(1.0, true, true),
+        ];
         let result = rejection(&answers);
-        assert_eq!((result.recall_at_full_precision, result.full_precision_threshold), (0.0, None));
+        assert_eq!(
+            (
+                result.recall_at_full_precision,
+                result.full_precision_threshold
+            ),
+            (0.0, None)
+        );
         assert_eq!(result.curve.len(), 2);
         assert_eq!(rejection(&[]).curve.len(), 0);
     }

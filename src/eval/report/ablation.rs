@@ -6,19 +6,38 @@ use crate::eval::summary::AtK;
 use std::fmt::Write;
 
 fn cell(recall: Option<&AtK<Option<f64>>>, k: usize) -> String {
-    recall.and_then(|recall| recall.get(&k).copied().flatten()).map_or("-".into(), |value| format!("{value:.1}"))
+    recall
+        .and_then(|recall| recall.get(&k).copied().flatten())
+        .map_or("-".into(), |value| format!("{value:.1}"))
 }
 
 fn numbers(row: &AblationRow) -> Vec<String> {
-    let mut cells: Vec<String> = [1, 5, 10].iter().map(|&k| cell(Some(&row.recall.global), k)).collect();
-    cells.extend([1, 5, 10].iter().map(|&k| cell(row.recall.reranked.as_ref(), k)));
+    let mut cells: Vec<String> = [1, 5, 10]
+        .iter()
+        .map(|&k| cell(Some(&row.recall.global), k))
+        .collect();
+    cells.extend(
+        [1, 5, 10]
+            .iter()
+            .map(|&k| cell(row.recall.reranked.as_ref(), k)),
+    );
     cells.push(format!("{:.0}", row.extract_seconds * 1e3));
     cells.push(format!("{:.1}", row.rerank_seconds * 1e3));
     cells.push(format!("{:.0}", row.patch_bytes / 1e3));
     cells
 }
 
-const HEADERS: [&str; 9] = ["gR@1", "gR@5", "gR@10", "R@1", "R@5", "R@10", "extract ms", "rerank ms", "patch kB"];
+const HEADERS: [&str; 9] = [
+    "gR@1",
+    "gR@5",
+    "gR@10",
+    "R@1",
+    "R@5",
+    "R@10",
+    "extract ms",
+    "rerank ms",
+    "patch kB",
+];
 
 /// Aligned columns; g marks the global ranking, a star the base setting.
 pub fn ablation_text(rows: &[AblationRow]) -> String {
@@ -48,5 +67,12 @@ pub fn ablation_html(rows: &[AblationRow]) -> String {
     let mut headers = vec!["axis", "setting"];
     headers.extend(HEADERS);
     let caption = "One setting varied at a time; g marks the global ranking by the mean token, * the base setting";
-    format!("<h2>Ablation</h2>\n{}", table(caption, &headers, &rows.iter().map(cells).collect::<Vec<_>>()))
+    format!(
+        "<h2>Ablation</h2>\n{}",
+        table(
+            caption,
+            &headers,
+            &rows.iter().map(cells).collect::<Vec<_>>()
+        )
+    )
 }

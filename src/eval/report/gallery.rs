@@ -1,5 +1,5 @@
-//! The worst and the best queries as pictures: the query, its nearest places before and after re-ranking, and what
-//! the key patches saw (the paper's visualisation figure).
+//! The worst and the best queries as pictures: the query, its nearest places before and after
+//! re-ranking, and what the key patches saw (the paper's visualisation figure).
 
 use super::html::escape;
 use crate::draw::{jpeg_data_uri, thumbnail};
@@ -27,8 +27,8 @@ const PICTURE_PX: u32 = 1400;
 const QUALITY: u8 = 78;
 const SHOWN: usize = 3;
 
-/// Up to `count` queries of each kind: those that went most wrong, those answered though no match exists, and those
-/// answered best. Empty where nothing was re-ranked.
+/// Up to `count` queries of each kind: those that went most wrong, those answered though no match
+/// exists, and those answered best. Empty where nothing was re-ranked.
 pub fn gallery(
     painter: &Painter<'_>,
     dataset: &Dataset,
@@ -48,9 +48,23 @@ pub fn gallery(
     Ok(out)
 }
 
-fn choose<'a>(dataset: &Dataset, answers: &'a [Answer], count: usize) -> [(&'static str, Vec<&'a Answer>); 3] {
-    let score = |answer: &Answer| answer.reranked.first().map_or(0, |best| best.score.spatial_score);
-    let rank = |answer: &Answer| first_hit(&answer.reranked_ranking(), dataset.truth[answer.query].positives());
+fn choose<'a>(
+    dataset: &Dataset,
+    answers: &'a [Answer],
+    count: usize,
+) -> [(&'static str, Vec<&'a Answer>); 3] {
+    let score = |answer: &Answer| {
+        answer
+            .reranked
+            .first()
+            .map_or(0, |best| best.score.spatial_score)
+    };
+    let rank = |answer: &Answer| {
+        first_hit(
+            &answer.reranked_ranking(),
+            dataset.truth[answer.query].positives(),
+        )
+    };
     let (mut wrong, mut right, mut unknown) = (Vec::new(), Vec::new(), Vec::new());
     for answer in answers.iter().filter(|answer| !answer.reranked.is_empty()) {
         match (&dataset.truth[answer.query], rank(answer)) {
@@ -61,7 +75,9 @@ fn choose<'a>(dataset: &Dataset, answers: &'a [Answer], count: usize) -> [(&'sta
         }
     }
     // Worst first: the positive ranked lowest or not found, then the surest mistake.
-    wrong.sort_by_key(|answer| std::cmp::Reverse((rank(answer).unwrap_or(usize::MAX), score(answer))));
+    wrong.sort_by_key(|answer| {
+        std::cmp::Reverse((rank(answer).unwrap_or(usize::MAX), score(answer)))
+    });
     unknown.sort_by_key(|answer| std::cmp::Reverse(score(answer)));
     right.sort_by_key(|answer| std::cmp::Reverse(score(answer)));
     let cut = |mut list: Vec<&'a Answer>| {
@@ -86,7 +102,11 @@ impl Painter<'_> {
         out += "</div><h3>Nearest by global distance</h3><div class=\"row\">";
         for neighbour in answer.global.iter().take(SHOWN) {
             let caption = format!("distance {:.3}", neighbour.distance);
-            out += &self.thumbnail(&dataset.database[neighbour.index], outline(is_right(neighbour.index)), &caption)?;
+            out += &self.thumbnail(
+                &dataset.database[neighbour.index],
+                outline(is_right(neighbour.index)),
+                &caption,
+            )?;
         }
         out += "</div><h3>Best after re-ranking</h3><div class=\"row\">";
         for candidate in answer.reranked.iter().take(SHOWN) {
@@ -96,8 +116,16 @@ impl Painter<'_> {
                 .iter()
                 .map(|c| format!("{} {}/{}", c.scales.score_name(), c.inliers, c.matches))
                 .collect();
-            let caption = format!("S = {} ({})", candidate.score.spatial_score, parts.join(", "));
-            out += &self.thumbnail(&dataset.database[candidate.index], outline(is_right(candidate.index)), &caption)?;
+            let caption = format!(
+                "S = {} ({})",
+                candidate.score.spatial_score,
+                parts.join(", ")
+            );
+            out += &self.thumbnail(
+                &dataset.database[candidate.index],
+                outline(is_right(candidate.index)),
+                &caption,
+            )?;
         }
         out += "</div>\n";
         if let Some(best) = answer.reranked.first() {
@@ -106,7 +134,8 @@ impl Painter<'_> {
         Ok(out + "</details>\n")
     }
 
-    /// The first positive that can be read. Images that could not be read took no part, but the truth still names them.
+    /// The first positive that can be read. Images that could not be read took no part, but the
+    /// truth still names them.
     fn right_answer(&self, dataset: &Dataset, truth: &Truth) -> Result<String, EvalError> {
         let mut reasons = Vec::new();
         for &positive in truth.positives() {
@@ -116,7 +145,9 @@ impl Painter<'_> {
                 Err(error) => reasons.push(format!("{}: {error}", item.name)),
             }
         }
-        let named = reasons.first().map(|first| placeholder("no right answer could be read", first));
+        let named = reasons
+            .first()
+            .map(|first| placeholder("no right answer could be read", first));
         Ok(named.unwrap_or_default())
     }
 
@@ -133,15 +164,22 @@ impl Painter<'_> {
         let (query_bytes, reference_bytes) = match (read(query), read(reference)) {
             (Ok(query), Ok(reference)) => (query, reference),
             (Err(error), _) | (_, Err(error)) => {
-                return Ok(title.to_owned() + &placeholder("no longer readable", &error.to_string()));
+                return Ok(
+                    title.to_owned() + &placeholder("no longer readable", &error.to_string())
+                );
             }
         };
         let see = |bytes: &[u8]| Seen::new(self.extractor, self.limits, bytes);
         let (query_seen, reference_seen) = (see(&query_bytes)?, see(&reference_bytes)?);
-        let matches = self.reranker.explain(&query_seen.patches, &reference_seen.patches);
+        let matches = self
+            .reranker
+            .explain(&query_seen.patches, &reference_seen.patches);
         let drawn = picture(&query_seen, &reference_seen, &matches)?;
         let uri = jpeg_data_uri(&thumbnail(&drawn, PICTURE_PX)?, QUALITY)?;
-        let alt = escape(&format!("inliers between {} and {}", query.name, reference.name));
+        let alt = escape(&format!(
+            "inliers between {} and {}",
+            query.name, reference.name
+        ));
         Ok(format!(
             "{title}<figure>\
              <img loading=\"lazy\" alt=\"{alt}\" src=\"{uri}\"><figcaption>Attention with the key patches of the three \
@@ -150,7 +188,12 @@ impl Painter<'_> {
     }
 }
 
-fn picture_of(item: &Item, image: &RgbImage, class: &str, caption: &str) -> Result<String, EvalError> {
+fn picture_of(
+    item: &Item,
+    image: &RgbImage,
+    class: &str,
+    caption: &str,
+) -> Result<String, EvalError> {
     let uri = jpeg_data_uri(&thumbnail(image, THUMBNAIL_PX)?, QUALITY)?;
     let (name, caption) = (escape(&item.name), escape(caption));
     Ok(format!(
@@ -162,7 +205,9 @@ fn picture_of(item: &Item, image: &RgbImage, class: &str, caption: &str) -> Resu
 /// What stands where a picture would.
 fn placeholder(caption: &str, reason: &str) -> String {
     let (caption, reason) = (escape(caption), escape(reason));
-    format!("<figure><figcaption>{caption}<br><span class=\"soft\">{reason}</span></figcaption></figure>")
+    format!(
+        "<figure><figcaption>{caption}<br><span class=\"soft\">{reason}</span></figcaption></figure>"
+    )
 }
 
 fn open(item: &Item, limits: &ImageConfig) -> Result<RgbImage, EvalError> {

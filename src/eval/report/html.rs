@@ -1,5 +1,5 @@
-//! The frame of every report page: one self-contained file, readable in light and dark, on paper and by a screen
-//! reader.
+//! The frame of every report page: one self-contained file, readable in light and dark, on paper
+//! and by a screen reader.
 
 /// Text made safe for HTML content and attributes.
 pub fn escape(text: &str) -> String {
@@ -30,12 +30,21 @@ pub fn page(title: &str, body: &str) -> String {
 
 /// A table; cells are HTML, the first column names the row.
 pub fn table(caption: &str, headers: &[&str], rows: &[Vec<String>]) -> String {
-    let head: String = headers.iter().map(|header| format!("<th scope=\"col\">{}</th>", escape(header))).collect();
+    let head: String = headers
+        .iter()
+        .map(|header| format!("<th scope=\"col\">{}</th>", escape(header)))
+        .collect();
     let row = |cells: &Vec<String>| {
         let cells: String = cells
             .iter()
             .enumerate()
-            .map(|(i, cell)| if i == 0 { format!("<th scope=\"row\">{cell}</th>") } else { format!("<td>{cell}</td>") })
+            .map(|(i, cell)| {
+                if i == 0 {
+                    format!("<th scope=\"row\">{cell}</th>")
+                } else {
+                    format!("<td>{cell}</td>")
+                }
+            })
             .collect();
         format!("<tr>{cells}</tr>\n")
     };
@@ -80,7 +89,10 @@ mod tests {
 
     #[test]
     fn nothing_in_a_name_can_become_markup() {
-        assert_eq!(escape("<a href='x'>&\""), "&lt;a href=&#39;x&#39;&gt;&amp;&quot;");
+        assert_eq!(
+            escape("<a href='x'>&\""),
+            "&lt;a href=&#39;x&#39;&gt;&amp;&quot;"
+        );
         let page = page("<t>", "");
         assert!(page.contains("<title>&lt;t&gt;</title>") && !page.contains("http"));
     }

@@ -20,9 +20,16 @@ use super::measure::RECALL_AT;
 use super::run::Answer;
 use super::summary::{AtK, GroupSummary, Summary};
 
-/// The whole page. `left_out` are answers that cannot be right, because the query's place was left out. `details` is HTML that follows the plots: single queries as pictures, an ablation
-/// table, or nothing.
-pub fn html(summary: &Summary, dataset: &Dataset, answers: &[Answer], left_out: &[Answer], details: &str) -> String {
+/// The whole page. `left_out` are answers that cannot be right, because the query's place was left
+/// out. `details` is HTML that follows the plots: single queries as pictures, an ablation table, or
+/// nothing.
+pub fn html(
+    summary: &Summary,
+    dataset: &Dataset,
+    answers: &[Answer],
+    left_out: &[Answer],
+    details: &str,
+) -> String {
     let mut body = format!(
         "<p class=\"lead\">{} queries, {} with a match and {} without, against {} references. Model <code>{}</code>.</p>\n",
         summary.queries,
@@ -69,11 +76,16 @@ fn recall_table(summary: &Summary) -> String {
         let mut cells = vec![name.to_owned()];
         for k in RECALL_AT {
             let interval: Option<&super::measure::Interval> = intervals.get(&k);
-            let range = interval
-                .map_or(String::new(), |i| format!(" <span class=\"soft\">[{:.1}, {:.1}]</span>", i.low, i.high));
+            let range = interval.map_or(String::new(), |i| {
+                format!(" <span class=\"soft\">[{:.1}, {:.1}]</span>", i.low, i.high)
+            });
             cells.push(percent(recall.get(&k).copied().flatten()) + &range);
         }
-        cells.push(map.values().last().map_or("-".into(), |value| format!("{value:.3}")));
+        cells.push(
+            map.values()
+                .last()
+                .map_or("-".into(), |value| format!("{value:.3}")),
+        );
         cells.push(format!("{:.1}", rejection.recall_at_full_precision));
         cells.push(format!("{:.3}", rejection.average_precision));
         rows.push(cells);
@@ -106,12 +118,26 @@ fn calibration_table(summary: &Summary) -> String {
     let mut rows = Vec::new();
     if let Some(fitted) = &summary.calibration {
         let error = format!("{:.3}", fitted.expected_calibration_error);
-        rows.push(vec!["fitted here, five-fold".into(), error, "-".into(), "-".into(), "-".into()]);
+        rows.push(vec![
+            "fitted here, five-fold".into(),
+            error,
+            "-".into(),
+            "-".into(),
+            "-".into(),
+        ]);
     }
-    for (name, applied) in
-        [("the model's own", &summary.shipped_calibration), ("the one given", &summary.given_calibration)]
-    {
-        let Some(Applied { expected_calibration_error, trusted, .. }) = applied else { continue };
+    for (name, applied) in [
+        ("the model's own", &summary.shipped_calibration),
+        ("the one given", &summary.given_calibration),
+    ] {
+        let Some(Applied {
+            expected_calibration_error,
+            trusted,
+            ..
+        }) = applied
+        else {
+            continue;
+        };
         rows.push(vec![
             name.into(),
             format!("{expected_calibration_error:.3}"),
@@ -123,14 +149,25 @@ fn calibration_table(summary: &Summary) -> String {
     if rows.is_empty() {
         return String::new();
     }
-    let headers = ["confidence", "calibration error", "trusted from", "precision of those, %", "recall of those, %"];
+    let headers = [
+        "confidence",
+        "calibration error",
+        "trusted from",
+        "precision of those, %",
+        "recall of those, %",
+    ];
     table("How far confidences can be believed", &headers, &rows)
 }
 
 fn poses_table(summary: &Summary) -> String {
-    let Some(poses) = &summary.poses else { return String::new() };
+    let Some(poses) = &summary.poses else {
+        return String::new();
+    };
     let mut rows = Vec::new();
-    for (name, accuracy) in [("global", Some(&poses.global)), ("re-ranked", poses.reranked.as_ref())] {
+    for (name, accuracy) in [
+        ("global", Some(&poses.global)),
+        ("re-ranked", poses.reranked.as_ref()),
+    ] {
         if let Some(accuracy) = accuracy {
             let mut cells = vec![name.to_owned()];
             cells.extend(accuracy.iter().map(|a| format!("{:.1}", a.percent)));
@@ -138,7 +175,11 @@ fn poses_table(summary: &Summary) -> String {
         }
     }
     let headers = ["ranking", "0.25 m, 2 deg", "0.5 m, 5 deg", "5 m, 10 deg"];
-    table("Queries, in percent, whose best match has nearly their pose", &headers, &rows)
+    table(
+        "Queries, in percent, whose best match has nearly their pose",
+        &headers,
+        &rows,
+    )
 }
 
 fn groups_table(summary: &Summary) -> String {
@@ -146,7 +187,13 @@ fn groups_table(summary: &Summary) -> String {
         return String::new();
     }
     let row = |(name, group): (&String, &GroupSummary)| {
-        let reranked = |k| group.recall.reranked.as_ref().and_then(|recall| recall.get(&k).copied().flatten());
+        let reranked = |k| {
+            group
+                .recall
+                .reranked
+                .as_ref()
+                .and_then(|recall| recall.get(&k).copied().flatten())
+        };
         let global = |k| group.recall.global.get(&k).copied().flatten();
         let mut cells = vec![escape(name), group.queries_with_match.to_string()];
         cells.extend([1, 5, 10].map(|k| percent(global(k))));
@@ -154,40 +201,91 @@ fn groups_table(summary: &Summary) -> String {
         cells
     };
     let rows: Vec<_> = summary.groups.iter().map(row).collect();
-    let headers = ["part", "queries", "global R@1", "R@5", "R@10", "re-ranked R@1", "R@5", "R@10"];
+    let headers = [
+        "part",
+        "queries",
+        "global R@1",
+        "R@5",
+        "R@10",
+        "re-ranked R@1",
+        "R@5",
+        "R@10",
+    ];
     table("By part of the data set", &headers, &rows)
 }
 
 fn costs_table(summary: &Summary) -> String {
     let s = &summary.seconds;
     let ms = |seconds: f64| format!("{:.2}", seconds * 1e3);
-    let cells = vec!["milliseconds".into(), ms(s.decode), ms(s.extract), ms(s.search), ms(s.load), ms(s.rerank)];
+    let cells = vec![
+        "milliseconds".into(),
+        ms(s.decode),
+        ms(s.extract),
+        ms(s.search),
+        ms(s.load),
+        ms(s.rerank),
+    ];
     let times = table(
-        &format!("Mean time per image and per query ({} candidates)", summary.config.candidates),
+        &format!(
+            "Mean time per image and per query ({} candidates)",
+            summary.config.candidates
+        ),
         &["", "decode", "extract", "search", "load", "re-rank"],
         &[cells],
     );
     let b = &summary.bytes;
     let kb = |bytes: f64| format!("{:.1}", bytes / 1e3);
-    let cells = vec!["kB".into(), kb(b.global), kb(b.pooled), kb(b.patches), kb(summary.bytes_per_reference)];
-    times + &table("Mean size of one reference at rest", &["", "global", "pooled", "key patches", "total"], &[cells])
+    let cells = vec![
+        "kB".into(),
+        kb(b.global),
+        kb(b.pooled),
+        kb(b.patches),
+        kb(summary.bytes_per_reference),
+    ];
+    times
+        + &table(
+            "Mean size of one reference at rest",
+            &["", "global", "pooled", "key patches", "total"],
+            &[cells],
+        )
 }
 
 fn problems(summary: &Summary) -> String {
     let mut out = String::new();
     let mut list = |title: String, names: Vec<String>| {
         if !names.is_empty() {
-            let items: String = names.iter().map(|name| format!("<li>{}</li>", escape(name))).collect();
-            out +=
-                &format!("<details><summary>{}</summary><ul class=\"names\">{items}</ul></details>\n", escape(&title));
+            let items: String = names
+                .iter()
+                .map(|name| format!("<li>{}</li>", escape(name)))
+                .collect();
+            out += &format!(
+                "<details><summary>{}</summary><ul class=\"names\">{items}</ul></details>\n",
+                escape(&title)
+            );
         }
     };
     list("Notes".into(), summary.notes.clone());
-    let unreadable: Vec<String> =
-        summary.unreadable.iter().map(|image| format!("{} {}: {}", image.side, image.name, image.reason)).collect();
-    list(format!("{} images could not be read", unreadable.len()), unreadable);
-    let skipped: Vec<String> =
-        summary.skipped.iter().map(|image| format!("{}: {}", image.name, image.reason)).collect();
-    list(format!("{} images were left out of the data set", skipped.len()), skipped);
-    if out.is_empty() { out } else { format!("<h2>Images and data</h2>\n{out}") }
+    let unreadable: Vec<String> = summary
+        .unreadable
+        .iter()
+        .map(|image| format!("{} {}: {}", image.side, image.name, image.reason))
+        .collect();
+    list(
+        format!("{} images could not be read", unreadable.len()),
+        unreadable,
+    );
+    let skipped: Vec<String> = summary
+        .skipped
+        .iter()
+        .map(|image| format!("{}: {}", image.name, image.reason))
+        .collect();
+    list(
+        format!("{} images were left out of the data set", skipped.len()),
+        skipped,
+    );
+    if out.is_empty() {
+        out
+    } else {
+        format!("<h2>Images and data</h2>\n{out}")
+    }
 }

@@ -1,5 +1,5 @@
-//! Plots as inline SVG: no script, no external asset; colours come from the page's style sheet, so that they follow
-//! the reader's light or dark setting.
+//! Plots as inline SVG: no script, no external asset; colours come from the page's style sheet, so
+//! that they follow the reader's light or dark setting.
 
 use super::html::escape;
 use std::fmt::Write;
@@ -45,11 +45,20 @@ impl LineChart {
     /// The chart as an `<svg>` element.
     pub fn render(&self) -> String {
         let mut canvas = Canvas::new(&self.title, self.x_range, self.y_range);
-        canvas.axes(&self.x_label, &self.y_label, &ticks(self.x_range), &ticks(self.y_range));
+        canvas.axes(
+            &self.x_label,
+            &self.y_label,
+            &ticks(self.x_range),
+            &ticks(self.y_range),
+        );
         for series in &self.series {
             canvas.line(series);
         }
-        canvas.legend(self.series.iter().map(|series| (series.name.as_str(), series.class)));
+        canvas.legend(
+            self.series
+                .iter()
+                .map(|series| (series.name.as_str(), series.class)),
+        );
         canvas.finish()
     }
 }
@@ -70,7 +79,11 @@ pub struct Histogram {
 impl Histogram {
     /// The histogram as an `<svg>` element.
     pub fn render(&self) -> String {
-        let all = || self.series.iter().flat_map(|(_, _, values)| values.iter().copied());
+        let all = || {
+            self.series
+                .iter()
+                .flat_map(|(_, _, values)| values.iter().copied())
+        };
         let low = all().fold(0f64, f64::min);
         let high = all().fold(low + 1.0, f64::max);
         let bins = self.bins.max(1);
@@ -82,17 +95,30 @@ impl Histogram {
             }
             counts
         };
-        let counts: Vec<Vec<usize>> = self.series.iter().map(|(_, _, values)| count(values)).collect();
+        let counts: Vec<Vec<usize>> = self
+            .series
+            .iter()
+            .map(|(_, _, values)| count(values))
+            .collect();
         let top = counts.iter().flatten().copied().max().unwrap_or(0).max(1) as f64;
         let mut canvas = Canvas::new(&self.title, (low, high), (0.0, top));
-        canvas.axes(&self.x_label, "queries", &ticks((low, high)), &ticks((0.0, top)));
+        canvas.axes(
+            &self.x_label,
+            "queries",
+            &ticks((low, high)),
+            &ticks((0.0, top)),
+        );
         for ((_, class, _), counts) in self.series.iter().zip(&counts) {
             for (bin, &count) in counts.iter().enumerate().filter(|&(_, &count)| count > 0) {
                 let start = low + bin as f64 * width;
                 canvas.bar((start, start + width), count as f64, class);
             }
         }
-        canvas.legend(self.series.iter().map(|(name, class, _)| (name.as_str(), *class)));
+        canvas.legend(
+            self.series
+                .iter()
+                .map(|(name, class, _)| (name.as_str(), *class)),
+        );
         canvas.finish()
     }
 }
@@ -105,7 +131,11 @@ fn ticks((low, high): (f64, f64)) -> Vec<f64> {
     }
     let rough = span / 5.0;
     let power = 10f64.powf(rough.log10().floor());
-    let step = [1.0, 2.0, 2.5, 5.0, 10.0].into_iter().map(|m| m * power).find(|s| *s >= rough - 1e-12).unwrap_or(span);
+    let step = [1.0, 2.0, 2.5, 5.0, 10.0]
+        .into_iter()
+        .map(|m| m * power)
+        .find(|s| *s >= rough - 1e-12)
+        .unwrap_or(span);
     let first = (low / step - 1e-9).ceil() as i64;
     let last = (high / step + 1e-9).floor() as i64;
     (first..=last).map(|i| i as f64 * step).collect()
@@ -115,7 +145,11 @@ fn ticks((low, high): (f64, f64)) -> Vec<f64> {
 fn short(value: f64) -> String {
     let text = format!("{value:.3}");
     let text = text.trim_end_matches('0').trim_end_matches('.');
-    if text == "-0" { "0".into() } else { text.into() }
+    if text == "-0" {
+        "0".into()
+    } else {
+        text.into()
+    }
 }
 
 struct Canvas {
@@ -131,7 +165,11 @@ impl Canvas {
         let svg = format!(
             "<svg class=\"plot\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{title}\"><title>{title}</title>"
         );
-        Self { svg, x_range, y_range }
+        Self {
+            svg,
+            x_range,
+            y_range,
+        }
     }
 
     fn x(&self, value: f64) -> f64 {
@@ -141,7 +179,9 @@ impl Canvas {
 
     fn y(&self, value: f64) -> f64 {
         let (low, high) = self.y_range;
-        HEIGHT - BOTTOM - (value - low) / (high - low).max(f64::MIN_POSITIVE) * (HEIGHT - TOP - BOTTOM)
+        HEIGHT
+            - BOTTOM
+            - (value - low) / (high - low).max(f64::MIN_POSITIVE) * (HEIGHT - TOP - BOTTOM)
     }
 
     fn axes(&mut self, x_label: &str, y_label: &str, x_ticks: &[f64], y_ticks: &[f64]) {
@@ -180,9 +220,17 @@ impl Canvas {
     }
 
     fn line(&mut self, series: &Series) {
-        let points: Vec<String> =
-            series.points.iter().map(|&(x, y)| format!("{:.1},{:.1}", self.x(x), self.y(y))).collect();
-        let _ = write!(self.svg, "<polyline class=\"line {}\" points=\"{}\"/>", series.class, points.join(" "));
+        let points: Vec<String> = series
+            .points
+            .iter()
+            .map(|&(x, y)| format!("{:.1},{:.1}", self.x(x), self.y(y)))
+            .collect();
+        let _ = write!(
+            self.svg,
+            "<polyline class=\"line {}\" points=\"{}\"/>",
+            series.class,
+            points.join(" ")
+        );
         if series.dots {
             for &(x, y) in &series.points {
                 let _ = write!(
@@ -248,13 +296,21 @@ mod tests {
         for (low, high) in [(-3.2, 9.9), (0.0, 1e-3), (0.0, 12345.0)] {
             let ticks = ticks((low, high));
             assert!((2..=7).contains(&ticks.len()), "{ticks:?}");
-            assert!(ticks.iter().all(|t| (low - 1e-9..=high + 1e-9).contains(t)), "{ticks:?}");
+            assert!(
+                ticks.iter().all(|t| (low - 1e-9..=high + 1e-9).contains(t)),
+                "{ticks:?}"
+            );
         }
     }
 
     #[test]
     fn ends_of_the_data_lie_on_the_frame() {
-        let series = Series { name: "<x>".into(), class: "a", points: vec![(0.0, 0.0), (10.0, 100.0)], dots: true };
+        let series = Series {
+            name: "<x>".into(),
+            class: "a",
+            points: vec![(0.0, 0.0), (10.0, 100.0)],
+            dots: true,
+        };
         let (x_label, y_label) = ("k".into(), "%".into());
         let chart = LineChart {
             title: "t \"q\"".into(),
@@ -266,14 +322,28 @@ mod tests {
         };
         let svg = chart.render();
         assert!(svg.contains("points=\"52.0,254.0 446.0,16.0\""), "{svg}");
-        assert!(svg.contains("&lt;x&gt;") && svg.contains("t &quot;q&quot;") && !svg.contains("NaN"));
+        assert!(
+            svg.contains("&lt;x&gt;") && svg.contains("t &quot;q&quot;") && !svg.contains("NaN")
+        );
     }
 
     #[test]
     fn every_value_is_counted_once() {
-        let series = vec![("right".to_owned(), "a", vec![0.0, 5.0, 10.0, 10.0]), ("none".to_owned(), "b", vec![])];
-        let svg = Histogram { title: "S".into(), x_label: "S".into(), series, bins: 2 }.render();
+        let series = vec![
+            ("right".to_owned(), "a", vec![0.0, 5.0, 10.0, 10.0]),
+            ("none".to_owned(), "b", vec![]),
+        ];
+        let svg = Histogram {
+            title: "S".into(),
+            x_label: "S".into(),
+            series,
+            bins: 2,
+        }
+        .render();
         assert_eq!(svg.matches("<rect class=\"bar a\"").count(), 2);
-        assert!(svg.contains("<title>0 to 5: 1</title>") && svg.contains("<title>5 to 10: 3</title>"), "{svg}");
+        assert!(
+            svg.contains("<title>0 to 5: 1</title>") && svg.contains("<title>5 to 10: 3</title>"),
+            "{svg}"
+        );
     }
 }

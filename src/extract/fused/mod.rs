@@ -1,17 +1,19 @@
 //! The transformer without intermediate tensors: what the service runs.
 //!
-//! The tokens of an image are cut into chunks of some dozens of rows, or a few hundred where there are matrix registers.
-//! After the queries, keys and values of a block exist, a chunk needs no other chunk until the next block: one task takes
-//! it through attention, projection, LayerNorm, MLP, LayerNorm and the next block's projections, each product finished
-//! (bias, GELU, residual) while it is in the first-level cache. So a block of the transformer is one parallel loop over
+//! The tokens of an image are cut into chunks of some dozens of rows, or a few hundred where there
+//! are matrix registers. After the queries, keys and values of a block exist, a chunk needs no
+//! other chunk until the next block: one task takes it through attention, projection, LayerNorm,
+//! MLP, LayerNorm and the next block's projections, each product finished (bias, GELU, residual)
+//! while it is in the first-level cache. So a block of the transformer is one parallel loop over
 //! the chunks of all images, and scores and hidden activations never reach memory.
 //!
-//! Products are in f32, or layers in bf16 or int8, which may differ from block to block, and then the scores of attention
-//! in int8 (bf16 in matrix registers) and its mix of values in bf16 (f32 where the CPU lacks it); everything between them
-//! is f32.
+//! Products are in f32, or layers in bf16 or int8, which may differ from block to block, and then
+//! the scores of attention in int8 (bf16 in matrix registers) and its mix of values in bf16 (f32
+//! where the CPU lacks it); everything between them is f32.
 //!
-//! No sum depends on how chunks are spread over threads or on other images, so a batch gives bit for bit what single
-//! images give. Buffers are kept between calls; in the steady state only the answer is allocated.
+//! No sum depends on how chunks are spread over threads or on other images, so a batch gives bit
+//! for bit what single images give. Buffers are kept between calls; in the steady state only the
+//! answer is allocated.
 
 mod chunk;
 mod operation;
@@ -20,7 +22,9 @@ mod spread;
 mod tests;
 mod weights;
 
-use super::encoder::{EncodedImage, Encoder, EncoderSpec, Precision, TokenGrid, check_image, token_grid};
+use super::encoder::{
+    EncodedImage, Encoder, EncoderSpec, Precision, TokenGrid, check_image, token_grid,
+};
 use super::error::ExtractError;
 use super::positions::interpolate;
 use super::preset::{Geometry, LAYER_NORM_EPS};
@@ -57,9 +61,17 @@ struct Pool<T>(Mutex<Vec<T>>);
 impl<T: Default> Pool<T> {
     fn with<R>(&self, use_it: impl FnOnce(&mut T) -> R) -> R {
         // What a panicking user left is still a valid buffer, and it is not returned anyway.
-        let mut item = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
+        let mut item = self
+            .0
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .pop()
+            .unwrap_or_default();
         let result = use_it(&mut item);
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(item);
+        self.0
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .push(item);
         result
     }
 }
@@ -83,12 +95,13 @@ pub struct FusedEncoder {
 }
 
 impl FusedEncoder {
-    /// Packs the weights of the blocks that `spec` needs, for the kernels of `simd`. The patch embedding is f32 at every
-    /// precision: it is a hundredth of the work, and what it loses no later block brings back.
+    /// Packs the weights of the blocks that `spec` needs, for the kernels of `simd`. The patch
+    /// embedding is f32 at every precision: it is a hundredth of the work, and what it loses no
+    /// later block brings back.
     ///
     /// # Errors
-    /// The spec names a block or size the geometry lacks, heads are too narrow for the kernels, or the CPU lacks what
-    /// the precision needs.
+    /// The spec names a block or size the geometry lacks, heads are too narrow for the kernels, or
+    /// the CPU lacks what the precision needs.
     pub fn new(
         weights: &VitWeights,
         spec: EncoderSpec,
@@ -107,17 +120,27 @@ impl FusedEncoder {
     ) -> Result<Self, ExtractError> {
         let geometry = weights.geometry;
         // Tiles do nothing for f32, and vectors of it are faster without regard to them.
-        let simd = if precision == Precision::F32 { simd.at_most(SimdLevel::Avx512) } else { simd };
+        let simd = if precision == Precision::F32 {
+            simd.at_most(SimdLevel::Avx512)
+        } else {
+            simd
+        };
         let (patch, size) = (geometry.patch, spec.input_size);
         if spec.blocks() > weights.blocks.len() {
-            let reason = format!("block {} was asked for, there are {}", spec.blocks() - 1, weights.blocks.len());
+            let reason = format!(
+                "block {} was asked for, there are {}",
+                spec.blocks() - 1,
+                weights.blocks.len()
+            );
             return Err(InvalidValue::new("exit_block", reason).into());
         }
         let whole = |side: u32| side > 0 && (side as usize).is_multiple_of(patch);
         if !whole(size.width) || !whole(size.height) {
-            return Err(
-                InvalidValue::new("input_size", format!("{size} is not whole patches of {patch} pixels")).into()
-            );
+            return Err(InvalidValue::new(
+                "input_size",
+                format!("{size} is not whole patches of {patch} pixels"),
+            )
+            .into());
         }
         let columns = Tiling::of(simd).columns;
         if !geometry.head_dim().is_multiple_of(columns) {
@@ -129,11 +152,21 @@ impl FusedEncoder {
             return Err(InvalidValue::new("heads", reason).into());
         }
         let grid = token_grid(&geometry, &spec);
-        let mut positions =
-            interpolate(&weights.positions, geometry.dim, weights.position_grid, (grid.rows, grid.columns));
-        positions.iter_mut().zip(&weights.cls_token).for_each(|(position, cls)| *position += cls);
+        let mut positions = interpolate(
+            &weights.positions,
+            geometry.dim,
+            weights.position_grid,
+            (grid.rows, grid.columns),
+        );
+        positions
+            .iter_mut()
+            .zip(&weights.cls_token)
+            .for_each(|(position, cls)| *position += cls);
         // The embedding adds its bias to every row, the CLS row too.
-        positions.iter_mut().zip(&weights.patch_embed.bias).for_each(|(position, bias)| *position -= bias);
+        positions
+            .iter_mut()
+            .zip(&weights.patch_embed.bias)
+            .for_each(|(position, bias)| *position -= bias);
         let shape = AttentionShape {
             scores: formats.scores,
             mix: formats.mix,
@@ -145,8 +178,15 @@ impl FusedEncoder {
         let dims = (geometry.dim, geometry.head_dim());
         let spreads = spread::measure(weights, formats.int8_blocks.end)?;
         let pack = |(index, block)| {
-            let spread = formats.int8_blocks.contains(&index).then(|| &spreads[index]);
-            let format = if spread.is_some() { Format::Int8 } else { formats.others };
+            let spread = formats
+                .int8_blocks
+                .contains(&index)
+                .then(|| &spreads[index]);
+            let format = if spread.is_some() {
+                Format::Int8
+            } else {
+                formats.others
+            };
             PackedBlock::pack((simd, format), block, dims, HIDDEN_SLICE, spread)
         };
         Ok(Self {
@@ -154,10 +194,19 @@ impl FusedEncoder {
             precision,
             geometry,
             grid,
-            plan: ChunkPlan { simd, shape, dim: geometry.dim, patch_len: 3 * patch * patch },
+            plan: ChunkPlan {
+                simd,
+                shape,
+                dim: geometry.dim,
+                patch_len: 3 * patch * patch,
+            },
             embedding: PackedLinear::plain(simd, &weights.patch_embed),
             positions,
-            blocks: weights.blocks[..spec.blocks()].par_iter().enumerate().map(pack).collect(),
+            blocks: weights.blocks[..spec.blocks()]
+                .par_iter()
+                .enumerate()
+                .map(pack)
+                .collect(),
             norm: weights.norm.clone(),
             workspaces: Pool(Mutex::default()),
             scratches: Pool(Mutex::default()),
@@ -168,11 +217,18 @@ impl FusedEncoder {
     fn plan_for(&self, images: usize) -> ChunkPlan {
         let ChunkPlan { simd, shape, .. } = self.plan;
         let chunk_rows = chunk_rows(simd, shape.tokens, images, rayon::current_num_threads());
-        ChunkPlan { shape: AttentionShape { chunk_rows, ..shape }, ..self.plan }
+        ChunkPlan {
+            shape: AttentionShape {
+                chunk_rows,
+                ..shape
+            },
+            ..self.plan
+        }
     }
 
-    /// Runs `task(image, chunk, keys, values, scratch)` for every chunk of every image, where `keys` and `values` are
-    /// the image's of the current block, and then makes what the chunks wrote the current ones.
+    /// Runs `task(image, chunk, keys, values, scratch)` for every chunk of every image, where
+    /// `keys` and `values` are the image's of the current block, and then makes what the chunks
+    /// wrote the current ones.
     fn each_chunk(
         &self,
         plan: &ChunkPlan,
@@ -184,7 +240,15 @@ impl FusedEncoder {
         let (rows_len, chunks) = (shape.chunk_rows * plan.dim, shape.chunks());
         let (keys_len, values_len) = (shape.keys_len(), shape.values_len());
         let queries_len = shape.queries_len();
-        let Workspace { tokens, queries, keys, values, next_keys, next_values, .. } = work;
+        let Workspace {
+            tokens,
+            queries,
+            keys,
+            values,
+            next_keys,
+            next_values,
+            ..
+        } = work;
         tokens.resize(images * chunks * rows_len);
         queries.resize(images * chunks * queries_len);
         for (buffer, len) in [
@@ -207,9 +271,16 @@ impl FusedEncoder {
                 let (image, index) = (at / chunks, at % chunks);
                 let of = |len: usize| image * chunks * len..(image + 1) * chunks * len;
                 let current = (&image_keys[of(keys_len)], &image_values[of(values_len)]);
-                let mut chunk = Chunk { index, tokens, queries, keys, values };
+                let mut chunk = Chunk {
+                    index,
+                    tokens,
+                    queries,
+                    keys,
+                    values,
+                };
                 let _ready = Readiness::new(plan.simd);
-                self.scratches.with(|scratch| task(image, &mut chunk, current, scratch));
+                self.scratches
+                    .with(|scratch| task(image, &mut chunk, current, scratch));
             });
         std::mem::swap(keys, next_keys);
         std::mem::swap(values, next_values);
@@ -221,7 +292,13 @@ impl FusedEncoder {
         let width = self.spec.input_size.width as usize;
         let mut encoded: Vec<_> = images.iter().map(|_| self.blank()).collect();
         self.each_chunk(plan, images.len(), work, |image, chunk, _, scratch| {
-            plan.embed(chunk, (images[image], width, side), &self.positions, &self.embedding, scratch);
+            plan.embed(
+                chunk,
+                (images[image], width, side),
+                &self.positions,
+                &self.embedding,
+                scratch,
+            );
             plan.project(chunk, &self.blocks[0], scratch);
         });
         for (index, block) in self.blocks.iter().enumerate() {
@@ -255,9 +332,14 @@ impl FusedEncoder {
         }
         let encoded = self.workspaces.with(|work| self.run(images, work));
         let finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
-        let whole =
-            |image: &EncodedImage| finite(&image.tokens) && finite(&image.cls_token) && finite(&image.cls_attention);
-        if encoded.iter().all(whole) { Ok(encoded) } else { Err(ExtractError::NotFinite) }
+        let whole = |image: &EncodedImage| {
+            finite(&image.tokens) && finite(&image.cls_token) && finite(&image.cls_attention)
+        };
+        if encoded.iter().all(whole) {
+            Ok(encoded)
+        } else {
+            Err(ExtractError::NotFinite)
+        }
     }
 
     fn blank(&self) -> EncodedImage {
@@ -272,10 +354,17 @@ impl FusedEncoder {
         }
     }
 
-    fn read_tokens(&self, shape: &AttentionShape, image: usize, work: &Workspace, out: &mut EncodedImage) {
+    fn read_tokens(
+        &self,
+        shape: &AttentionShape,
+        image: usize,
+        work: &Workspace,
+        out: &mut EncodedImage,
+    ) {
         let dim = self.geometry.dim;
         let padded = shape.chunks() * shape.chunk_rows * dim;
-        let (cls, patches) = work.tokens[image * padded..][..(1 + self.grid.len()) * dim].split_at(dim);
+        let (cls, patches) =
+            work.tokens[image * padded..][..(1 + self.grid.len()) * dim].split_at(dim);
         (out.cls_token, out.tokens) = if self.spec.token_norm {
             (self.final_norm(cls), self.final_norm(patches))
         } else {
@@ -285,16 +374,30 @@ impl FusedEncoder {
 
     fn final_norm(&self, rows: &[f32]) -> Vec<f32> {
         let mut out = vec![0.0; rows.len()];
-        normalize_rows(self.plan.simd, self.geometry.dim, LAYER_NORM_EPS, rows, &mut out);
+        normalize_rows(
+            self.plan.simd,
+            self.geometry.dim,
+            LAYER_NORM_EPS,
+            rows,
+            &mut out,
+        );
         for row in out.chunks_exact_mut(self.geometry.dim) {
-            for ((value, scale), shift) in row.iter_mut().zip(&self.norm.weight).zip(&self.norm.bias) {
+            for ((value, scale), shift) in
+                row.iter_mut().zip(&self.norm.weight).zip(&self.norm.bias)
+            {
                 *value = *value * scale + shift;
             }
         }
         out
     }
 
-    fn read_attention(&self, shape: &AttentionShape, image: usize, work: &mut Workspace, out: &mut EncodedImage) {
+    fn read_attention(
+        &self,
+        shape: &AttentionShape,
+        image: usize,
+        work: &mut Workspace,
+        out: &mut EncodedImage,
+    ) {
         let simd = self.plan.simd;
         let queries_len = shape.chunks() * shape.queries_len();
         let keys_len = shape.chunks() * shape.keys_len();
@@ -322,24 +425,61 @@ struct Formats {
 }
 
 /// What `precision` comes to at this level in so many blocks; `Auto` is settled.
-fn choose_formats(simd: Simd, precision: Precision, blocks: usize) -> Result<(Precision, Formats), ExtractError> {
+fn choose_formats(
+    simd: Simd,
+    precision: Precision,
+    blocks: usize,
+) -> Result<(Precision, Formats), ExtractError> {
     let lacks = |what: &str| {
-        let reason = format!("it needs a CPU with {what}, used at level avx512; this is level {}", simd.level());
-        Err(ExtractError::Precision { precision: precision.name(), reason })
+        let reason = format!(
+            "it needs a CPU with {what}, used at level avx512; this is level {}",
+            simd.level()
+        );
+        Err(ExtractError::Precision {
+            precision: precision.name(),
+            reason,
+        })
     };
-    let (int8, bf16) = (Format::Int8.is_available(simd), Format::Bf16.is_available(simd));
+    let (int8, bf16) = (
+        Format::Int8.is_available(simd),
+        Format::Bf16.is_available(simd),
+    );
     let mix = if bf16 { Format::Bf16 } else { Format::F32 };
-    // A head's codes lose no more of a score than bf16 does. Where matrix registers multiply bf16, finishing sums of
-    // integers would take as long as it saves.
-    let scores = if int8 && simd.level() < SimdLevel::Amx { Format::Int8 } else { mix };
-    let chosen = |int8_blocks, others| Ok((precision, Formats { int8_blocks, others, scores, mix }));
+    // A head's codes lose no more of a score than bf16 does. Where matrix registers multiply bf16,
+    // finishing sums of integers would take as long as it saves.
+    let scores = if int8 && simd.level() < SimdLevel::Amx {
+        Format::Int8
+    } else {
+        mix
+    };
+    let chosen = |int8_blocks, others| {
+        Ok((
+            precision,
+            Formats {
+                int8_blocks,
+                others,
+                scores,
+                mix,
+            },
+        ))
+    };
     match precision {
         // At level scalar codes are possible, but slower than floats.
-        Precision::Auto if simd.level() >= SimdLevel::Avx512 => choose_formats(simd, Precision::Mixed, blocks),
+        Precision::Auto if simd.level() >= SimdLevel::Avx512 => {
+            choose_formats(simd, Precision::Mixed, blocks)
+        }
         Precision::Auto => choose_formats(simd, Precision::F32, blocks),
         Precision::F32 => {
             let (others, scores, mix) = (Format::F32, Format::F32, Format::F32);
-            Ok((precision, Formats { int8_blocks: 0..0, others, scores, mix }))
+            Ok((
+                precision,
+                Formats {
+                    int8_blocks: 0..0,
+                    others,
+                    scores,
+                    mix,
+                },
+            ))
         }
         Precision::Bf16 if bf16 => chosen(0..0, Format::Bf16),
         Precision::Bf16 => lacks("AVX-512 BF16"),
@@ -349,8 +489,9 @@ fn choose_formats(simd: Simd, precision: Precision, blocks: usize) -> Result<(Pr
     }
 }
 
-/// Of so many blocks, those that [`Precision::Mixed`] computes in int8: from the second to the middle. There an error
-/// costs least: the first block's inputs stray most, and what the later ones lose no block evens out.
+/// Of so many blocks, those that [`Precision::Mixed`] computes in int8: from the second to the
+/// middle. There an error costs least: the first block's inputs stray most, and what the later ones
+/// lose no block evens out.
 pub fn mixed_int8_blocks(blocks: usize) -> Range<usize> {
     1..blocks.div_ceil(2).max(1)
 }
@@ -371,7 +512,9 @@ impl Encoder for FusedEncoder {
     }
 
     fn encode(&self, images: &[ImageTensor]) -> Result<Vec<EncodedImage>, ExtractError> {
-        images.iter().try_for_each(|image| check_image(image, &self.spec))?;
+        images
+            .iter()
+            .try_for_each(|image| check_image(image, &self.spec))?;
         let pixels: Vec<&[f32]> = images.iter().map(|image| image.data.as_slice()).collect();
         self.encode_pixels(&pixels)
     }

@@ -1,12 +1,13 @@
-//! The weights of a transformer as the fused encoder multiplies by them: packed once, with everything that is linear
-//! folded in.
+//! The weights of a transformer as the fused encoder multiplies by them: packed once, with
+//! everything that is linear folded in.
 //!
-//! A LayerNorm's scale and shift go into the layer that reads it (W diag(g), b + W s), LayerScale into the layer it
-//! scales (diag(l) W, l b), and the factor log2(e) / sqrt(head_dim) into the query rows, so that scores are exponents of
-//! two. The bias of the keys adds the same to all scores of a query, which softmax takes out again: it is left out. Keys
-//! are that much smaller, and what bf16 loses of a score is no more than what it loses elsewhere. Inputs that become int8
-//! codes are centred and scaled by channel first ([`super::spread`]); W and b make that good. Sums are taken in f64 once;
-//! what is left at run time is products, biases, and nothing else.
+//! A LayerNorm's scale and shift go into the layer that reads it (W diag(g), b + W s), LayerScale
+//! into the layer it scales (diag(l) W, l b), and the factor log2(e) / sqrt(head_dim) into the
+//! query rows, so that scores are exponents of two. The bias of the keys adds the same to all
+//! scores of a query, which softmax takes out again: it is left out. Keys are that much smaller,
+//! and what bf16 loses of a score is no more than what it loses elsewhere. Inputs that become int8
+//! codes are centred and scaled by channel first ([`super::spread`]); W and b make that good. Sums
+//! are taken in f64 once; what is left at run time is products, biases, and nothing else.
 
 use super::spread::{BlockSpread, Spread};
 use crate::extract::weights::{BlockWeights, Linear, Norm};
@@ -27,8 +28,9 @@ pub(super) struct PackedLinear {
 }
 
 impl PackedLinear {
-    /// Packs y = W x + b, to be multiplied `slice` inputs at a time, after giving element `(out, in)` of W the factor
-    /// `rows(out) * columns(in)`, b the factor `rows(out)`, and b further what `shift` through W comes to.
+    /// Packs y = W x + b, to be multiplied `slice` inputs at a time, after giving element `(out,
+    /// in)` of W the factor `rows(out) * columns(in)`, b the factor `rows(out)`, and b further what
+    /// `shift` through W comes to.
     fn pack(
         (simd, format): (Simd, Format),
         layer: &Linear,
@@ -39,21 +41,33 @@ impl PackedLinear {
         let (outputs, inputs) = (layer.bias.len(), layer.weight.len() / layer.bias.len());
         let scale = |input: usize| columns.map_or(1.0, |norm| norm.weight[input]);
         let element = |i: usize, o: usize| layer.weight[o * inputs + i] * (rows(o) * scale(i));
-        let weight = PackedMatrix::pack(simd, format, (inputs, outputs), slice.min(inputs), element);
+        let weight =
+            PackedMatrix::pack(simd, format, (inputs, outputs), slice.min(inputs), element);
         let shifted = |o: usize| {
             let row = &layer.weight[o * inputs..(o + 1) * inputs];
             let shift = columns.map_or(0.0, |norm| {
-                row.iter().zip(&norm.bias).map(|(&w, &s)| f64::from(w) * f64::from(s)).sum::<f64>()
+                row.iter()
+                    .zip(&norm.bias)
+                    .map(|(&w, &s)| f64::from(w) * f64::from(s))
+                    .sum::<f64>()
             });
             ((f64::from(layer.bias[o]) + shift) * f64::from(rows(o))) as f32
         };
         let padded = outputs.next_multiple_of(Tiling::of(simd).columns);
-        let bias = (0..padded).map(|o| if o < outputs { shifted(o) } else { 0.0 }).collect();
-        Self { weight, bias, gain: Vec::new(), shift: Vec::new() }
+        let bias = (0..padded)
+            .map(|o| if o < outputs { shifted(o) } else { 0.0 })
+            .collect();
+        Self {
+            weight,
+            bias,
+            gain: Vec::new(),
+            shift: Vec::new(),
+        }
     }
 
-    /// Packs a layer that multiplies what `spread` makes of its inputs. They come without the scale and shift of
-    /// `norm`, the LayerNorm before it if there is one; these go to the inputs that become codes, or else into W and b.
+    /// Packs a layer that multiplies what `spread` makes of its inputs. They come without the scale
+    /// and shift of `norm`, the LayerNorm before it if there is one; these go to the inputs that
+    /// become codes, or else into W and b.
     fn pack_spread(
         kernels: (Simd, Format),
         layer: &Linear,
@@ -61,10 +75,13 @@ impl PackedLinear {
         rows: impl Fn(usize) -> f32,
         (norm, spread): (Option<&Norm>, Option<&Spread>),
     ) -> Self {
-        let Some(spread) = spread else { return Self::pack(kernels, layer, slice, rows, norm) };
+        let Some(spread) = spread else {
+            return Self::pack(kernels, layer, slice, rows, norm);
+        };
         let inputs = 0..spread.centre.len();
         let gain = |i: usize| norm.map_or(1.0, |norm| norm.weight[i]) / spread.scale[i];
-        let shift = |i: usize| (norm.map_or(0.0, |norm| norm.bias[i]) - spread.centre[i]) / spread.scale[i];
+        let shift =
+            |i: usize| (norm.map_or(0.0, |norm| norm.bias[i]) - spread.centre[i]) / spread.scale[i];
         Self {
             gain: inputs.clone().map(gain).collect(),
             shift: inputs.map(shift).collect(),
@@ -77,7 +94,10 @@ impl PackedLinear {
         if self.gain.is_empty() {
             return Channels::default();
         }
-        Channels { gain: &self.gain[range.clone()], shift: &self.shift[range] }
+        Channels {
+            gain: &self.gain[range.clone()],
+            shift: &self.shift[range],
+        }
     }
 
     /// Packs a layer as it is, in f32.
@@ -93,7 +113,10 @@ impl PackedLinear {
 
     pub fn bytes(&self) -> usize {
         self.weight.bytes()
-            + [&self.bias, &self.gain, &self.shift].map(|values| size_of_val(values.as_slice())).iter().sum::<usize>()
+            + [&self.bias, &self.gain, &self.shift]
+                .map(|values| size_of_val(values.as_slice()))
+                .iter()
+                .sum::<usize>()
     }
 }
 
@@ -106,8 +129,8 @@ pub(super) struct PackedBlock {
 }
 
 impl PackedBlock {
-    /// Packs a block whose hidden layer is computed `hidden_slice` numbers at a time, and whose inputs are scaled by
-    /// `spread` if they become codes.
+    /// Packs a block whose hidden layer is computed `hidden_slice` numbers at a time, and whose
+    /// inputs are scaled by `spread` if they become codes.
     pub fn pack(
         kernels: (Simd, Format),
         block: &BlockWeights,
@@ -116,9 +139,11 @@ impl PackedBlock {
         spread: Option<&BlockSpread>,
     ) -> Self {
         let query_scale = std::f32::consts::LOG2_E / (head_dim as f32).sqrt();
-        let scale = |layer_scale: &Option<Vec<f32>>, o: usize| layer_scale.as_ref().map_or(1.0, |scale| scale[o]);
-        // Softmax's weights add up to one, so that what is done to all values is done to every mix of them: the
-        // projection's inputs come scaled.
+        let scale = |layer_scale: &Option<Vec<f32>>, o: usize| {
+            layer_scale.as_ref().map_or(1.0, |scale| scale[o])
+        };
+        // Softmax's weights add up to one, so that what is done to all values is done to every mix
+        // of them: the projection's inputs come scaled.
         let mixed = spread.map(|spread| &spread.proj);
         let query_or_value = |o: usize| match o {
             _ if o < dim => query_scale,
@@ -131,12 +156,17 @@ impl PackedBlock {
         qkv.bias[dim..2 * dim].fill(0.0);
         if let Some(Spread { centre, scale }) = mixed {
             let values = qkv.bias[2 * dim..3 * dim].iter_mut();
-            values.zip(centre.iter().zip(scale)).for_each(|(bias, (centre, scale))| *bias -= centre / scale);
+            values
+                .zip(centre.iter().zip(scale))
+                .for_each(|(bias, (centre, scale))| *bias -= centre / scale);
         }
         let undone = mixed.map(Spread::undone);
         let norm2 = (Some(&block.norm2), spread.map(|spread| &spread.fc1));
         let hidden = (None, spread.map(|spread| &spread.fc2));
-        let (scale1, scale2) = (|o| scale(&block.layer_scale1, o), |o| scale(&block.layer_scale2, o));
+        let (scale1, scale2) = (
+            |o| scale(&block.layer_scale1, o),
+            |o| scale(&block.layer_scale2, o),
+        );
         Self {
             qkv,
             proj: PackedLinear::pack(kernels, &block.proj, whole, scale1, undone.as_ref()),

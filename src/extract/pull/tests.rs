@@ -28,7 +28,14 @@ impl Mock {
     fn of(body: Vec<u8>) -> Self {
         let etag = hex(&Sha256::digest(&body));
         let seen = Arc::default();
-        Self { body: Arc::new(body), etag, cut_after: None, no_ranges: false, status: None, seen }
+        Self {
+            body: Arc::new(body),
+            etag,
+            cut_after: None,
+            no_ranges: false,
+            status: None,
+            seen,
+        }
     }
 
     /// Serves until the test process ends; returns the endpoint.
@@ -36,7 +43,12 @@ impl Mock {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap();
         let mock = self.clone();
-        std::thread::spawn(move || listener.incoming().flatten().for_each(|stream| mock.answer(stream)));
+        std::thread::spawn(move || {
+            listener
+                .incoming()
+                .flatten()
+                .for_each(|stream| mock.answer(stream))
+        });
         format!("http://{address}")
     }
 
@@ -52,7 +64,10 @@ impl Mock {
 
     fn write_answer(&self, stream: &mut TcpStream, head: &str) -> std::io::Result<()> {
         if let Some(status) = self.status {
-            return write!(stream, "HTTP/1.1 {status}\r\ncontent-length: 0\r\nconnection: close\r\n\r\n");
+            return write!(
+                stream,
+                "HTTP/1.1 {status}\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
+            );
         }
         let total = self.body.len();
         if head.starts_with("head") {
@@ -62,17 +77,39 @@ impl Mock {
                 "HTTP/1.1 302 Found\r\nlocation: /elsewhere\r\nx-linked-etag: \"{etag}\"\r\nx-linked-size: {total}\r\n{close}\r\n\r\n"
             );
         }
-        let range =
-            head.lines().find_map(|line| line.strip_prefix("range: bytes=")?.trim_end_matches('-').parse().ok());
-        let start: usize = if self.no_ranges { 0 } else { range.unwrap_or(0) };
-        let status = if start > 0 { "206 Partial Content" } else { "200 OK" };
+        let range = head.lines().find_map(|line| {
+            line.strip_prefix("range: bytes=")?
+                .trim_end_matches('-')
+                .parse()
+                .ok()
+        });
+        let start: usize = if self.no_ranges {
+            0
+        } else {
+            range.unwrap_or(0)
+        };
+        let status = if start > 0 {
+            "206 Partial Content"
+        } else {
+            "200 OK"
+        };
         let rest = &self.body[start..];
-        write!(stream, "HTTP/1.1 {status}\r\ncontent-length: {}\r\nconnection: close\r\n\r\n", rest.len())?;
+        write!(
+            stream,
+            "HTTP/1.1 {status}\r\ncontent-length: {}\r\nconnection: close\r\n\r\n",
+            rest.len()
+        )?;
         stream.write_all(&rest[..rest.len().min(self.cut_after.unwrap_or(usize::MAX))])
     }
 
     fn requests(&self, method: &str) -> Vec<String> {
-        self.seen.lock().unwrap().iter().filter(|head| head.starts_with(method)).cloned().collect()
+        self.seen
+            .lock()
+            .unwrap()
+            .iter()
+            .filter(|head| head.starts_with(method))
+            .cloned()
+            .collect()
     }
 }
 
@@ -85,7 +122,12 @@ fn hub(endpoint: String) -> Hub {
 }
 
 fn fetch(mock: &Mock, dir: &Path) -> Result<PathBuf, PullError> {
-    hub(mock.start()).fetch("owner/model", "model.safetensors", &dir.join("model.safetensors"), &ProgressBar::hidden())
+    hub(mock.start()).fetch(
+        "owner/model",
+        "model.safetensors",
+        &dir.join("model.safetensors"),
+        &ProgressBar::hidden(),
+    )
 }
 
 #[test]
@@ -93,38 +135,71 @@ fn a_file_arrives_whole() {
     let (mock, dir) = (Mock::of(body()), tempfile::tempdir().unwrap());
     let part = fetch(&mock, dir.path()).unwrap();
     assert_eq!(std::fs::read(part).unwrap(), body());
-    assert!(mock.requests("get")[0].starts_with("get /owner/model/resolve/main/model.safetensors "));
+    assert!(
+        mock.requests("get")[0].starts_with("get /owner/model/resolve/main/model.safetensors ")
+    );
 }
 
 #[test]
 fn a_broken_connection_is_resumed_where_it_stopped() {
-    let mock = Mock { cut_after: Some(40_000), ..Mock::of(body()) };
+    let mock = Mock {
+        cut_after: Some(40_000),
+        ..Mock::of(body())
+    };
     let dir = tempfile::tempdir().unwrap();
-    assert_eq!(std::fs::read(fetch(&mock, dir.path()).unwrap()).unwrap(), body());
+    assert_eq!(
+        std::fs::read(fetch(&mock, dir.path()).unwrap()).unwrap(),
+        body()
+    );
     let gets = mock.requests("get");
     assert_eq!(gets.len(), 3);
-    assert!(gets[1].contains("range: bytes=40000-") && gets[2].contains("range: bytes=80000-"), "{gets:?}");
+    assert!(
+        gets[1].contains("range: bytes=40000-") && gets[2].contains("range: bytes=80000-"),
+        "{gets:?}"
+    );
 }
 
 #[test]
 fn an_earlier_process_part_is_continued_also_without_range_support() {
     for no_ranges in [false, true] {
         let dir = tempfile::tempdir().unwrap();
-        let short = Mock { cut_after: Some(10_000), ..Mock::of(body()) };
+        let short = Mock {
+            cut_after: Some(10_000),
+            ..Mock::of(body())
+        };
         let error = fetch(&short, dir.path()).unwrap_err().to_string();
-        assert!(error.contains("of 100000 bytes") || error.contains("body"), "{error}");
-        let mock = Mock { no_ranges, ..Mock::of(body()) };
-        assert_eq!(std::fs::read(fetch(&mock, dir.path()).unwrap()).unwrap(), body());
-        assert!(mock.requests("get")[0].contains("range: bytes=40000-"), "{:?}", mock.requests("get"));
+        assert!(
+            error.contains("of 100000 bytes") || error.contains("body"),
+            "{error}"
+        );
+        let mock = Mock {
+            no_ranges,
+            ..Mock::of(body())
+        };
+        assert_eq!(
+            std::fs::read(fetch(&mock, dir.path()).unwrap()).unwrap(),
+            body()
+        );
+        assert!(
+            mock.requests("get")[0].contains("range: bytes=40000-"),
+            "{:?}",
+            mock.requests("get")
+        );
     }
 }
 
 #[test]
 fn a_wrong_hash_is_refused_after_one_fresh_try_and_leaves_nothing() {
-    let mock = Mock { etag: "ab".repeat(32), ..Mock::of(body()) };
+    let mock = Mock {
+        etag: "ab".repeat(32),
+        ..Mock::of(body())
+    };
     let dir = tempfile::tempdir().unwrap();
     let error = fetch(&mock, dir.path()).unwrap_err();
-    assert!(matches!(&error, PullError::WrongHash { expected, .. } if *expected == "ab".repeat(32)), "{error}");
+    assert!(
+        matches!(&error, PullError::WrongHash { expected, .. } if *expected == "ab".repeat(32)),
+        "{error}"
+    );
     assert_eq!(mock.requests("get").len(), 2);
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
 }
@@ -134,14 +209,22 @@ fn a_spoiled_part_is_thrown_away_and_fetched_anew() {
     let (mock, dir) = (Mock::of(body()), tempfile::tempdir().unwrap());
     let part = fetch(&mock, dir.path()).unwrap();
     std::fs::write(&part, vec![0; 50_000]).unwrap();
-    assert_eq!(std::fs::read(fetch(&mock, dir.path()).unwrap()).unwrap(), body());
+    assert_eq!(
+        std::fs::read(fetch(&mock, dir.path()).unwrap()).unwrap(),
+        body()
+    );
 }
 
 #[test]
 fn a_missing_file_fails_at_once_and_a_sick_server_after_some_tries() {
     for (status, tries) in [("404 Not Found", 1), ("503 Service Unavailable", 4)] {
-        let mock = Mock { status: Some(status), ..Mock::of(body()) };
-        let error = fetch(&mock, tempfile::tempdir().unwrap().path()).unwrap_err().to_string();
+        let mock = Mock {
+            status: Some(status),
+            ..Mock::of(body())
+        };
+        let error = fetch(&mock, tempfile::tempdir().unwrap().path())
+            .unwrap_err()
+            .to_string();
         assert!(error.contains(&status[..3]), "{error}");
         assert_eq!(mock.requests("head").len(), tries, "{status}");
     }
@@ -151,8 +234,18 @@ fn a_missing_file_fails_at_once_and_a_sick_server_after_some_tries() {
 fn the_token_is_sent_to_the_hub() {
     let (mock, dir) = (Mock::of(body()), tempfile::tempdir().unwrap());
     let hub = Hub::new(mock.start(), Some("secret".into()), Duration::ZERO);
-    hub.fetch("o/m", "model.safetensors", &dir.path().join("m"), &ProgressBar::hidden()).unwrap();
-    assert!(mock.requests("").iter().all(|head| head.contains("authorization: bearer secret")));
+    hub.fetch(
+        "o/m",
+        "model.safetensors",
+        &dir.path().join("m"),
+        &ProgressBar::hidden(),
+    )
+    .unwrap();
+    assert!(
+        mock.requests("")
+            .iter()
+            .all(|head| head.contains("authorization: bearer secret"))
+    );
 }
 
 #[test]
@@ -160,9 +253,18 @@ fn what_is_not_the_model_never_reaches_the_cache() {
     let (mock, dir) = (Mock::of(body()), tempfile::tempdir().unwrap());
     let target = dir.path().join("model.safetensors");
     let hub = hub(mock.start());
-    let puller = Puller { target: target.clone(), preset: Preset::Dinov2Vits14, hub, wheel: false, offline: false };
+    let puller = Puller {
+        target: target.clone(),
+        preset: Preset::Dinov2Vits14,
+        hub,
+        wheel: false,
+        offline: false,
+    };
     let error = puller.pull(false).unwrap_err().to_string();
-    assert!(error.contains("dinov2-vits14 could not be fetched") && error.contains("safetensors"), "{error}");
+    assert!(
+        error.contains("dinov2-vits14 could not be fetched") && error.contains("safetensors"),
+        "{error}"
+    );
     assert!(!target.exists());
 }
 
@@ -172,11 +274,20 @@ fn an_unreachable_hub_is_named_in_the_message() {
     let target = dir.path().join("model.safetensors");
     // Port 9 (discard) is closed on any machine that runs tests.
     let hub = hub("http://127.0.0.1:9".into());
-    let error = Puller { target, preset: Preset::Dinov2Vits14, hub, wheel: false, offline: false }
-        .pull(false)
-        .unwrap_err()
-        .to_string();
-    assert!(error.contains("Tried:") && error.contains("http://127.0.0.1:9/facebook/dinov2-small"), "{error}");
+    let error = Puller {
+        target,
+        preset: Preset::Dinov2Vits14,
+        hub,
+        wheel: false,
+        offline: false,
+    }
+    .pull(false)
+    .unwrap_err()
+    .to_string();
+    assert!(
+        error.contains("Tried:") && error.contains("http://127.0.0.1:9/facebook/dinov2-small"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -184,12 +295,29 @@ fn a_damaged_cached_model_is_noticed() {
     let dir = tempfile::tempdir().unwrap();
     let target = dir.path().join("model.safetensors");
     std::fs::write(&target, b"not what was fetched").unwrap();
-    let record = Record { preset: "x".into(), source: "x".into(), sha256: "00".repeat(32), bytes: 20 };
+    let record = Record {
+        preset: "x".into(),
+        source: "x".into(),
+        sha256: "00".repeat(32),
+        bytes: 20,
+    };
     record.save(&target).unwrap();
-    assert!(matches!(super::super::record::verify(&target), Err(ExtractError::HashMismatch { .. })));
+    assert!(matches!(
+        super::super::record::verify(&target),
+        Err(ExtractError::HashMismatch { .. })
+    ));
     let hub = hub("http://127.0.0.1:9".into());
-    let puller = Puller { target, preset: Preset::Dinov2Vits14, hub, wheel: false, offline: false };
-    assert!(matches!(puller.pull(false), Err(PullError::AllFailed { .. })), "it must try to fetch it again");
+    let puller = Puller {
+        target,
+        preset: Preset::Dinov2Vits14,
+        hub,
+        wheel: false,
+        offline: false,
+    };
+    assert!(
+        matches!(puller.pull(false), Err(PullError::AllFailed { .. })),
+        "it must try to fetch it again"
+    );
 }
 
 /// Weights of the default preset's shapes, all zero.
@@ -198,8 +326,14 @@ fn zero_weights() -> VitWeights {
     let preset = Preset::Dinov2Vits14;
     let geometry = preset.geometry();
     let (dim, mlp, position_grid) = (geometry.dim, geometry.mlp_dim, (37, 37));
-    let linear = |from: usize, to: usize| Linear { weight: vec![0.0; from * to], bias: vec![0.0; to] };
-    let norm = || Norm { weight: vec![0.0; dim], bias: vec![0.0; dim] };
+    let linear = |from: usize, to: usize| Linear {
+        weight: vec![0.0; from * to],
+        bias: vec![0.0; to],
+    };
+    let norm = || Norm {
+        weight: vec![0.0; dim],
+        bias: vec![0.0; dim],
+    };
     let block = || BlockWeights {
         norm1: norm(),
         qkv: linear(dim, 3 * dim),
@@ -233,12 +367,34 @@ fn well_formed_weights_that_are_not_the_presets_count_as_a_source_that_failed() 
     let target = dir.path().join("model.safetensors");
     let preset = Preset::Dinov2Vits14;
     let hub = hub(mock.start());
-    let error = Puller { target: target.clone(), preset, hub, wheel: false, offline: false }.pull(false).unwrap_err();
-    let PullError::AllFailed { tried, .. } = &error else { panic!("the next source would not be tried: {error}") };
-    assert!(tried[0].contains("other weights") && tried[0].contains(preset.content_sha256().unwrap()), "{tried:?}");
+    let error = Puller {
+        target: target.clone(),
+        preset,
+        hub,
+        wheel: false,
+        offline: false,
+    }
+    .pull(false)
+    .unwrap_err();
+    let PullError::AllFailed { tried, .. } = &error else {
+        panic!("the next source would not be tried: {error}")
+    };
+    assert!(
+        tried[0].contains("other weights") && tried[0].contains(preset.content_sha256().unwrap()),
+        "{tried:?}"
+    );
     assert!(!target.exists());
-    let parts = std::fs::read_dir(dir.path())
-        .unwrap()
-        .filter(|entry| entry.as_ref().unwrap().path().extension().is_some_and(|extension| extension == "part"));
-    assert_eq!(parts.count(), 0, "what can never become the model is not kept");
+    let parts = std::fs::read_dir(dir.path()).unwrap().filter(|entry| {
+        entry
+            .as_ref()
+            .unwrap()
+            .path()
+            .extension()
+            .is_some_and(|extension| extension == "part")
+    });
+    assert_eq!(
+        parts.count(),
+        0,
+        "what can never become the model is not kept"
+    );
 }

@@ -19,7 +19,12 @@ fn fused() -> File {
         ("norm.bias".to_owned(), vec![d]),
     ];
     for i in 0..12 {
-        for (name, out, input) in [("attn.qkv", 3 * d, d), ("attn.proj", d, d), ("mlp.fc1", m, d), ("mlp.fc2", d, m)] {
+        for (name, out, input) in [
+            ("attn.qkv", 3 * d, d),
+            ("attn.proj", d, d),
+            ("mlp.fc1", m, d),
+            ("mlp.fc2", d, m),
+        ] {
             shapes.push((format!("blocks.{i}.{name}.weight"), vec![out, input]));
             shapes.push((format!("blocks.{i}.{name}.bias"), vec![out]));
         }
@@ -38,12 +43,24 @@ fn load(file: &File) -> Result<VitWeights, ExtractError> {
     load_with(file, None, None)
 }
 
-fn load_with(file: &File, metadata: Option<&str>, heads: Option<usize>) -> Result<VitWeights, ExtractError> {
+fn load_with(
+    file: &File,
+    metadata: Option<&str>,
+    heads: Option<usize>,
+) -> Result<VitWeights, ExtractError> {
     let views = file.iter().map(|(name, (shape, values))| {
-        (name, TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(values)).unwrap())
+        (
+            name,
+            TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(values)).unwrap(),
+        )
     });
     let metadata = metadata.map(|heads| [("num_heads".to_owned(), heads.to_owned())].into());
-    VitWeights::from_bytes(&serialize(views, metadata).unwrap(), Path::new("w.safetensors"), PRESET, heads)
+    VitWeights::from_bytes(
+        &serialize(views, metadata).unwrap(),
+        Path::new("w.safetensors"),
+        PRESET,
+        heads,
+    )
 }
 
 fn problems(file: &File) -> Vec<String> {
@@ -56,9 +73,19 @@ fn problems(file: &File) -> Vec<String> {
 #[test]
 fn a_complete_file_loads_under_any_prefix_and_with_a_classifier() {
     let plain = load(&fused()).unwrap();
-    assert_eq!((plain.blocks.len(), plain.position_grid, plain.geometry.heads), (12, (14, 14), 12));
+    assert_eq!(
+        (
+            plain.blocks.len(),
+            plain.position_grid,
+            plain.geometry.heads
+        ),
+        (12, (14, 14), 12)
+    );
     assert_eq!(plain.parameters(), 21_665_664);
-    let mut prefixed: File = fused().into_iter().map(|(name, t)| (format!("module.backbone.{name}"), t)).collect();
+    let mut prefixed: File = fused()
+        .into_iter()
+        .map(|(name, t)| (format!("module.backbone.{name}"), t))
+        .collect();
     prefixed.insert("head.weight".into(), (vec![1000, 384], vec![0.0; 384_000]));
     let prefixed = load(&prefixed).unwrap();
     assert_eq!(prefixed.content_hash(), plain.content_hash());
@@ -69,11 +96,22 @@ fn a_complete_file_loads_under_any_prefix_and_with_a_classifier() {
 fn hugging_faces_naming_gives_the_same_weights() {
     let mut renamed = File::new();
     for (name, (shape, values)) in fused() {
-        if let Some(base) = name.find("attn.qkv").map(|at| name[..at].replace("blocks", "encoder.layer")) {
+        if let Some(base) = name
+            .find("attn.qkv")
+            .map(|at| name[..at].replace("blocks", "encoder.layer"))
+        {
             let kind = name.rsplit('.').next().unwrap();
-            for (part, values) in ["query", "key", "value"].iter().zip(values.chunks(values.len() / 3)) {
-                let shape = std::iter::once(shape[0] / 3).chain(shape[1..].iter().copied()).collect();
-                renamed.insert(format!("{base}attention.attention.{part}.{kind}"), (shape, values.to_vec()));
+            for (part, values) in ["query", "key", "value"]
+                .iter()
+                .zip(values.chunks(values.len() / 3))
+            {
+                let shape = std::iter::once(shape[0] / 3)
+                    .chain(shape[1..].iter().copied())
+                    .collect();
+                renamed.insert(
+                    format!("{base}attention.attention.{part}.{kind}"),
+                    (shape, values.to_vec()),
+                );
             }
             continue;
         }
@@ -114,17 +152,36 @@ fn every_fault_is_named_and_nothing_is_loaded() {
 #[test]
 fn an_impossible_position_table_is_named() {
     let mut file = fused();
-    file.insert("pos_embed".into(), (vec![1, 200, 384], vec![0.0; 200 * 384]));
-    assert!(problems(&file)[0].contains("pos_embed is [1, 200, 384]"), "{:?}", problems(&file));
+    file.insert(
+        "pos_embed".into(),
+        (vec![1, 200, 384], vec![0.0; 200 * 384]),
+    );
+    assert!(
+        problems(&file)[0].contains("pos_embed is [1, 200, 384]"),
+        "{:?}",
+        problems(&file)
+    );
 }
 
 #[test]
 fn heads_come_from_the_settings_then_the_file_then_the_preset() {
-    let heads = |metadata, setting| load_with(&fused(), metadata, setting).map(|weights| weights.geometry.heads);
+    let heads = |metadata, setting| {
+        load_with(&fused(), metadata, setting).map(|weights| weights.geometry.heads)
+    };
     assert_eq!(heads(Some("6"), None).unwrap(), 6);
     assert_eq!(heads(Some("6"), Some(8)).unwrap(), 8);
-    assert!(heads(Some("six"), None).unwrap_err().to_string().contains("six"));
-    assert!(heads(None, Some(7)).unwrap_err().to_string().contains("7 heads"));
+    assert!(
+        heads(Some("six"), None)
+            .unwrap_err()
+            .to_string()
+            .contains("six")
+    );
+    assert!(
+        heads(None, Some(7))
+            .unwrap_err()
+            .to_string()
+            .contains("7 heads")
+    );
 }
 
 #[test]
@@ -135,9 +192,18 @@ fn saved_weights_load_again_and_damage_is_refused() {
     weights.save(&path).unwrap();
     assert_eq!(VitWeights::load(&path, PRESET, None).unwrap(), weights);
     let bytes = std::fs::read(&path).unwrap();
-    let refused = |bytes: &[u8]| VitWeights::from_bytes(bytes, &path, PRESET, None).unwrap_err().to_string();
+    let refused = |bytes: &[u8]| {
+        VitWeights::from_bytes(bytes, &path, PRESET, None)
+            .unwrap_err()
+            .to_string()
+    };
     assert!(refused(&bytes[..bytes.len() / 2]).contains("truncated"));
     assert!(refused(b"<html>404</html>").contains("not a safetensors file"));
-    let other = VitWeights::from_bytes(&bytes, &path, Preset::Dinov2Vits14, None).unwrap_err().to_string();
-    assert!(other.contains("does not hold dinov2-vits14") && other.contains("ls1.gamma"), "{other}");
+    let other = VitWeights::from_bytes(&bytes, &path, Preset::Dinov2Vits14, None)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        other.contains("does not hold dinov2-vits14") && other.contains("ls1.gamma"),
+        "{other}"
+    );
 }

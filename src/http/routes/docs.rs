@@ -13,10 +13,16 @@ use utoipa_swagger_ui::{Config, SwaggerUi};
     (status = 200, description = "The document.", body = Object, content_type = "application/json"),
 ))]
 pub async fn openapi_json() -> Response {
-    ([(header::CONTENT_TYPE, "application/json")], openapi::document_text()).into_response()
+    (
+        [(header::CONTENT_TYPE, "application/json")],
+        openapi::document_text(),
+    )
+        .into_response()
 }
 
 /// The page that shows the document and tries requests.
 pub fn swagger_ui() -> Router<AppState> {
-    Router::from(SwaggerUi::new("/docs").config(Config::from("/openapi.json").try_it_out_enabled(true)))
+    Router::from(
+        SwaggerUi::new("/docs").config(Config::from("/openapi.json").try_it_out_enabled(true)),
+    )
 }

@@ -15,14 +15,16 @@ pub struct InfoBody {
     /// Version of the program.
     #[schema(example = "0.1.0")]
     pub version: &'static str,
-    /// The model: maps of another one can be searched here only if they keep a head of their own for the same backbone.
+    /// The model: maps of another one can be searched here only if they keep a head of their own
+    /// for the same backbone.
     pub model: String,
     /// Images are resized to this before anything is computed.
     pub input_size: SizeBody,
     /// Scale combinations whose inliers add up to S.
     #[schema(example = json!(["1", "1+2", "2+3"]))]
     pub scales: Vec<String>,
-    /// What `matched` and `confidence` come from on maps without a calibration of their own; null: they are null there.
+    /// What `matched` and `confidence` come from on maps without a calibration of their own; null:
+    /// they are null there.
     pub calibration: Option<Calibration>,
     /// Bounds and defaults of requests.
     pub limits: LimitsBody,
@@ -58,7 +60,10 @@ pub async fn info(State(state): State<AppState>) -> Result<Json<InfoBody>, ApiEr
     Ok(Json(InfoBody {
         version: env!("CARGO_PKG_VERSION"),
         model: info.model.to_string(),
-        input_size: SizeBody { width: info.input_size.width, height: info.input_size.height },
+        input_size: SizeBody {
+            width: info.input_size.width,
+            height: info.input_size.height,
+        },
         scales: info.rerank.scales.iter().map(ToString::to_string).collect(),
         calibration: info.calibration,
         limits: LimitsBody {

@@ -29,7 +29,8 @@ pub struct MapBody {
     /// When it was created.
     #[serde(with = "time::serde::rfc3339")]
     pub created_at: OffsetDateTime,
-    /// How far its best answers can be trusted; null: as far as the model's own calibration says, see `/info`.
+    /// How far its best answers can be trusted; null: as far as the model's own calibration says,
+    /// see `/info`.
     pub calibration: Option<Calibration>,
 }
 
@@ -67,11 +68,18 @@ pub struct MapDeleted {
 ))]
 pub async fn list(State(state): State<AppState>) -> Result<Json<MapList>, ApiError> {
     let maps = state.service()?.maps().await?;
-    Ok(Json(MapList { maps: maps.into_iter().map(Into::into).collect() }))
+    Ok(Json(MapList {
+        maps: maps.into_iter().map(Into::into).collect(),
+    }))
 }
 
 fn parse_name(text: &str) -> Result<MapName, ApiError> {
-    text.parse().map_err(|error| ApiError::new(ErrorCode::MapNotFound, format!("no map can have this name: {error}")))
+    text.parse().map_err(|error| {
+        ApiError::new(
+            ErrorCode::MapNotFound,
+            format!("no map can have this name: {error}"),
+        )
+    })
 }
 
 /// One map
@@ -81,7 +89,10 @@ fn parse_name(text: &str) -> Result<MapName, ApiError> {
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 200, description = "The map.", body = MapBody),
 ))]
-pub async fn get(State(state): State<AppState>, Path(map): Path<String>) -> Result<Json<MapBody>, ApiError> {
+pub async fn get(
+    State(state): State<AppState>,
+    Path(map): Path<String>,
+) -> Result<Json<MapBody>, ApiError> {
     Ok(Json(state.service()?.map(parse_name(&map)?).await?.into()))
 }
 
@@ -92,15 +103,19 @@ pub async fn get(State(state): State<AppState>, Path(map): Path<String>) -> Resu
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 200, description = "It is gone.", body = MapDeleted),
 ))]
-pub async fn delete(State(state): State<AppState>, Path(map): Path<String>) -> Result<Json<MapDeleted>, ApiError> {
+pub async fn delete(
+    State(state): State<AppState>,
+    Path(map): Path<String>,
+) -> Result<Json<MapDeleted>, ApiError> {
     let references_deleted = state.service()?.delete_map(parse_name(&map)?).await?;
     Ok(Json(MapDeleted { references_deleted }))
 }
 
 /// Calibrate a map
 ///
-/// From the next query on, `matched` and `confidence` come from this. `placeformer eval calibrate` fits it. It must
-/// have been fitted for the map's model and this server's re-ranking, else the answer is 409 with both identities.
+/// From the next query on, `matched` and `confidence` come from this. `placeformer eval calibrate`
+/// fits it. It must have been fitted for the map's model and this server's re-ranking, else the
+/// answer is 409 with both identities.
 #[utoipa::path(put, path = "/maps/{map}/calibration", operation_id = "calibrate_map", tag = "maps", request_body = Calibration,
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 200, description = "The calibration as it is stored.", body = Calibration),
@@ -112,7 +127,9 @@ pub async fn calibrate(
 ) -> Result<Json<Calibration>, ApiError> {
     let service = state.service()?;
     let calibration: Calibration = read_json(&state, request).await?;
-    service.set_calibration(parse_name(&map)?, Some(calibration.clone())).await?;
+    service
+        .set_calibration(parse_name(&map)?, Some(calibration.clone()))
+        .await?;
     Ok(Json(calibration))
 }
 
@@ -123,21 +140,28 @@ pub async fn calibrate(
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 204, description = "The map has no calibration of its own."),
 ))]
-pub async fn uncalibrate(State(state): State<AppState>, Path(map): Path<String>) -> Result<StatusCode, ApiError> {
-    state.service()?.set_calibration(parse_name(&map)?, None).await?;
+pub async fn uncalibrate(
+    State(state): State<AppState>,
+    Path(map): Path<String>,
+) -> Result<StatusCode, ApiError> {
+    state
+        .service()?
+        .set_calibration(parse_name(&map)?, None)
+        .await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
 /// Give a map another head
 ///
-/// The body is a head's file, as `placeformer head fit` or `head train` writes it. The global descriptors of all
-/// references are made anew from the pooled tokens that are kept, without the images; the answer comes when that is
-/// done. Queries are answered throughout, with the old head until the new one is in force; new references wait only
-/// for the moment of changing over. The map keeps its head whatever head the server runs, and loses its calibration,
-/// which holds for the old model alone.
+/// The body is a head's file, as `placeformer head fit` or `head train` writes it. The global
+/// descriptors of all references are made anew from the pooled tokens that are kept, without the
+/// images; the answer comes when that is done. Queries are answered throughout, with the old head
+/// until the new one is in force; new references wait only for the moment of changing over. The map
+/// keeps its head whatever head the server runs, and loses its calibration, which holds for the old
+/// model alone.
 ///
-/// A head made for another backbone or another pooling of tokens is refused with both identities (409). One head can be
-/// given at a time (503).
+/// A head made for another backbone or another pooling of tokens is refused with both identities
+/// (409). One head can be given at a time (503).
 #[utoipa::path(put, path = "/maps/{map}/head", operation_id = "give_map_head", tag = "maps",
     request_body(content = String, content_type = "application/octet-stream"),
     params(("map" = String, Path, description = "The map's name.")), responses(
@@ -155,12 +179,21 @@ pub async fn rehead(
 
 /// Give a map the server's head
 ///
-/// As with `PUT`, but with the head that the server itself runs, which the map then goes along with. This is also how a
-/// map made by a server with another head is brought over to this one.
+/// As with `PUT`, but with the head that the server itself runs, which the map then goes along
+/// with. This is also how a map made by a server with another head is brought over to this one.
 #[utoipa::path(delete, path = "/maps/{map}/head", operation_id = "remove_map_head", tag = "maps",
     params(("map" = String, Path, description = "The map's name.")), responses(
     (status = 200, description = "The map with the server's model.", body = MapBody),
 ))]
-pub async fn unhead(State(state): State<AppState>, Path(map): Path<String>) -> Result<Json<MapBody>, ApiError> {
-    Ok(Json(state.service()?.set_head(parse_name(&map)?, None).await?.into()))
+pub async fn unhead(
+    State(state): State<AppState>,
+    Path(map): Path<String>,
+) -> Result<Json<MapBody>, ApiError> {
+    Ok(Json(
+        state
+            .service()?
+            .set_head(parse_name(&map)?, None)
+            .await?
+            .into(),
+    ))
 }

@@ -90,12 +90,15 @@ pub struct CorrespondenceBody {
 
 /// Match two images
 ///
-/// Send the images as the multipart parts `query` and `reference`, as base64 in JSON under the same names, or the
-/// query as the raw body with `reference_id`.
+/// Send the images as the multipart parts `query` and `reference`, as base64 in JSON under the same
+/// names, or the query as the raw body with `reference_id`.
 #[utoipa::path(post, path = "/match", operation_id = "match_images", tag = "query", params(MatchParams), responses(
     (status = 200, description = "The correspondences and homographies.", body = MatchAnswerBody),
 ))]
-pub async fn match_images(State(state): State<AppState>, request: Request) -> Result<Response, ApiError> {
+pub async fn match_images(
+    State(state): State<AppState>,
+    request: Request,
+) -> Result<Response, ApiError> {
     let service = state.service()?;
     let mut upload = read_upload::<MatchParams>(&state, request, &["query", "reference"]).await?;
     let query = upload.take("query")?;
@@ -103,14 +106,25 @@ pub async fn match_images(State(state): State<AppState>, request: Request) -> Re
     let other = match (upload.take_optional("reference")?, reference_id) {
         (Some(image), None) => MatchSide::Image(image),
         (None, Some(id)) => MatchSide::Reference(id),
-        _ => return Err(ApiError::invalid("give either the image \"reference\" or reference_id")),
+        _ => {
+            return Err(ApiError::invalid(
+                "give either the image \"reference\" or reference_id",
+            ));
+        }
     };
     let answer = service.match_images(query, other).await?;
     let pair = &answer.matched;
     let body = MatchAnswerBody {
         spatial_score: pair.combinations.iter().map(|one| one.score.inliers).sum(),
-        combinations: pair.combinations.iter().map(|one| named(pair, one)).collect(),
-        input_size: SizeBody { width: answer.input_size.width, height: answer.input_size.height },
+        combinations: pair
+            .combinations
+            .iter()
+            .map(|one| named(pair, one))
+            .collect(),
+        input_size: SizeBody {
+            width: answer.input_size.width,
+            height: answer.input_size.height,
+        },
         timings_ms: timings_ms(&answer.timings),
         model: answer.model.to_string(),
     };

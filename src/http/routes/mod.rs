@@ -17,7 +17,11 @@ use utoipa_axum::routes;
 pub fn all() -> OpenApiRouter<AppState> {
     OpenApiRouter::new()
         .routes(routes!(references::create, references::list))
-        .routes(routes!(references::get, references::update, references::delete))
+        .routes(routes!(
+            references::get,
+            references::update,
+            references::delete
+        ))
         .routes(routes!(query::query))
         .routes(routes!(match_images::match_images))
         .routes(routes!(maps::list))

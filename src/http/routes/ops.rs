@@ -23,7 +23,8 @@ pub struct LiveBody {
 /// Ready or not, and why not.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct ReadyBody {
-    /// `ready`, or why not: `loading_model`, `migrating`, `building_index`, `draining`, `disk_full`.
+    /// `ready`, or why not: `loading_model`, `migrating`, `building_index`, `draining`,
+    /// `disk_full`.
     #[schema(example = "ready")]
     status: &'static str,
     /// Progress of `building_index`: references indexed and in all.
@@ -54,8 +55,8 @@ pub async fn livez() -> Json<LiveBody> {
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct ReadyParams {
-    /// `query`: only whether queries, listings and deletions are answered, which they are on a full disk, too. Left
-    /// out: also whether new references are taken.
+    /// `query`: only whether queries, listings and deletions are answered, which they are on a full
+    /// disk, too. Left out: also whether new references are taken.
     #[serde(rename = "for")]
     #[param(rename = "for", inline)]
     purpose: Option<ReadyFor>,
@@ -71,9 +72,9 @@ enum ReadyFor {
 
 /// Can it take requests?
 ///
-/// 503 with the reason while it cannot; send requests elsewhere meanwhile, do not restart it. A balancer should ask
-/// `/readyz?for=query`: a full disk (`disk_full`) keeps a server from storing, which it answers with 507 itself, but
-/// not from answering queries and deleting.
+/// 503 with the reason while it cannot; send requests elsewhere meanwhile, do not restart it. A
+/// balancer should ask `/readyz?for=query`: a full disk (`disk_full`) keeps a server from storing,
+/// which it answers with 507 itself, but not from answering queries and deleting.
 #[utoipa::path(get, path = "/readyz", operation_id = "readyz", tag = "service", params(ReadyParams), responses(
     (status = 200, description = "It can.", body = ReadyBody),
     (status = 503, description = "It cannot: `status` says why.", body = ReadyBody),
@@ -89,14 +90,27 @@ pub async fn readyz(State(state): State<AppState>, uri: Uri) -> Result<Response,
 
 fn answer(unready: Option<Unready>) -> Response {
     let Some(reason) = unready else {
-        return Json(ReadyBody { status: "ready", progress: None }).into_response();
+        return Json(ReadyBody {
+            status: "ready",
+            progress: None,
+        })
+        .into_response();
     };
     let progress = match reason {
         Unready::BuildingIndex { done, total } => Some(ProgressBody { done, total }),
         _ => None,
     };
-    let body = Json(ReadyBody { status: reason.as_str(), progress });
-    (StatusCode::SERVICE_UNAVAILABLE, Extension(OwnBody), [(header::RETRY_AFTER, "1")], body).into_response()
+    let body = Json(ReadyBody {
+        status: reason.as_str(),
+        progress,
+    });
+    (
+        StatusCode::SERVICE_UNAVAILABLE,
+        Extension(OwnBody),
+        [(header::RETRY_AFTER, "1")],
+        body,
+    )
+        .into_response()
 }
 
 /// Metrics for Prometheus
@@ -106,7 +120,9 @@ fn answer(unready: Option<Unready>) -> Response {
     (status = 200, description = "All series.", body = String, content_type = "text/plain"),
 ))]
 pub async fn metrics(State(state): State<AppState>) -> Result<Response, ApiError> {
-    state.metrics.set_ready(state.health.unready_for_queries().is_none());
+    state
+        .metrics
+        .set_ready(state.health.unready_for_queries().is_none());
     if let Some(service) = state.started() {
         service.observe().await;
     }

@@ -53,8 +53,8 @@ pub struct QueryParams {
     #[param(value_type = Option<String>, format = DateTime)]
     #[serde(default, with = "time::serde::rfc3339::option")]
     pub captured_before: Option<OffsetDateTime>,
-    /// Milliseconds for the answer, counted from the arrival of the request's head. Too short for re-ranking, the
-    /// answer is the global ranking and says `"reranked": false`.
+    /// Milliseconds for the answer, counted from the arrival of the request's head. Too short for
+    /// re-ranking, the answer is the global ranking and says `"reranked": false`.
     #[schema(minimum = 1)]
     #[param(minimum = 1, example = 2000)]
     pub deadline_ms: Option<u64>,
@@ -72,7 +72,8 @@ pub struct CheckedQuery {
 }
 
 impl QueryParams {
-    /// Checks what the types cannot; the counts are checked by the pipeline, which knows their bounds.
+    /// Checks what the types cannot; the counts are checked by the pipeline, which knows their
+    /// bounds.
     pub fn checked(self) -> Result<CheckedQuery, ApiError> {
         let filter = ReferenceFilter {
             near: self.near()?,
@@ -84,8 +85,16 @@ impl QueryParams {
         }
         let (top_k, candidates, rerank) = (self.top_k, self.candidates, self.rerank);
         Ok(CheckedQuery {
-            map: self.map.ok_or_else(|| ApiError::invalid("map: it is required"))?,
-            options: QueryOptions { top_k, candidates, rerank, filter, deadline: None },
+            map: self
+                .map
+                .ok_or_else(|| ApiError::invalid("map: it is required"))?,
+            options: QueryOptions {
+                top_k,
+                candidates,
+                rerank,
+                filter,
+                deadline: None,
+            },
             budget: self.deadline_ms.map(Duration::from_millis),
         })
     }
@@ -94,13 +103,19 @@ impl QueryParams {
         match (&self.near, self.radius_m) {
             (Some(near), Some(radius_m)) => Ok(Some(GeoCircle::new(parse_point(near)?, radius_m)?)),
             (None, None) => Ok(None),
-            _ => Err(ApiError::invalid("near and radius_m belong together: give both or neither")),
+            _ => Err(ApiError::invalid(
+                "near and radius_m belong together: give both or neither",
+            )),
         }
     }
 }
 
 fn parse_point(text: &str) -> Result<GeoPoint, ApiError> {
-    let wrong = || ApiError::invalid(format!("near: {text:?} is not LAT,LON, such as 51.5072,-0.1276"));
+    let wrong = || {
+        ApiError::invalid(format!(
+            "near: {text:?} is not LAT,LON, such as 51.5072,-0.1276"
+        ))
+    };
     let (lat, lon) = text.split_once(',').ok_or_else(wrong)?;
     let parse = |part: &str| part.trim().parse::<f64>().map_err(|_| wrong());
     Ok(GeoPoint::new(parse(lat)?, parse(lon)?)?)
@@ -113,10 +128,11 @@ pub struct QueryAnswerBody {
     pub results: Vec<QueryResultBody>,
     /// Whether the order comes from re-ranking; else it is the order of global distance.
     pub reranked: bool,
-    /// Whether the first result is trusted: its confidence reaches the threshold of the map's calibration, else of the
-    /// model's. False without any result; null if there is no calibration.
+    /// Whether the first result is trusted: its confidence reaches the threshold of the map's
+    /// calibration, else of the model's. False without any result; null if there is no calibration.
     pub matched: Option<bool>,
-    /// Probability that the first result shows the right place; 0 without any result; null if there is no calibration.
+    /// Probability that the first result shows the right place; 0 without any result; null if there
+    /// is no calibration.
     #[schema(minimum = 0, maximum = 1, example = 0.97)]
     pub confidence: Option<f64>,
     /// Milliseconds per stage, as in the `Server-Timing` header.
@@ -180,13 +196,17 @@ impl QueryResultBody {
 
 fn scores(score: &PairScore) -> BTreeMap<String, CombinationBody> {
     let body = |inliers, matches| CombinationBody { matches, inliers };
-    score.combinations.iter().map(|one| (one.scales.score_name(), body(one.inliers, one.matches))).collect()
+    score
+        .combinations
+        .iter()
+        .map(|one| (one.scales.score_name(), body(one.inliers, one.matches)))
+        .collect()
 }
 
 /// Find the places a photo may show
 ///
-/// The image is the raw body with the options as query parameters, or a multipart part `image` beside a part `json`,
-/// or base64 in JSON beside the options.
+/// The image is the raw body with the options as query parameters, or a multipart part `image`
+/// beside a part `json`, or base64 in JSON beside the options.
 #[utoipa::path(post, path = "/query", operation_id = "query", tag = "query", params(QueryParams), responses(
     (status = 200, description = "The ranked places; none if the map, or what the filter leaves of it, is empty.",
         body = QueryAnswerBody, headers(("server-timing" = String, description = "Milliseconds per stage."))),
@@ -196,17 +216,34 @@ pub async fn query(State(state): State<AppState>, request: Request) -> Result<Re
     let service = state.service()?;
     let mut upload = read_upload::<QueryParams>(&state, request, &["image"]).await?;
     let image = upload.take("image")?;
-    let CheckedQuery { map, mut options, budget } = std::mem::take(&mut upload.params).checked()?;
+    let CheckedQuery {
+        map,
+        mut options,
+        budget,
+    } = std::mem::take(&mut upload.params).checked()?;
     let most = Duration::from_millis(service.config().deadline_ms);
-    options.deadline = Some(Deadline::after(budget.unwrap_or(most).min(most).saturating_sub(arrived.elapsed())));
-    let answer = service.query(QueryRequest { map, image, options }).await?;
+    options.deadline = Some(Deadline::after(
+        budget
+            .unwrap_or(most)
+            .min(most)
+            .saturating_sub(arrived.elapsed()),
+    ));
+    let answer = service
+        .query(QueryRequest {
+            map,
+            image,
+            options,
+        })
+        .await?;
     Ok(respond(answer))
 }
 
 fn respond(answer: QueryAnswer) -> Response {
     let results = answer.results.into_iter().enumerate();
     let body = QueryAnswerBody {
-        results: results.map(|(position, result)| QueryResultBody::new(position, result)).collect(),
+        results: results
+            .map(|(position, result)| QueryResultBody::new(position, result))
+            .collect(),
         reranked: answer.reranked,
         matched: answer.verdict.matched,
         confidence: answer.verdict.confidence,

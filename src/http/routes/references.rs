@@ -30,7 +30,8 @@ pub struct ReferenceParams {
     #[param(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", value_type = Option<String>, example = "harbour")]
     #[serde(default)]
     pub map: Option<MapName>,
-    /// Your own name for the photo, unique in the map. Sending the same photo under it again changes nothing.
+    /// Your own name for the photo, unique in the map. Sending the same photo under it again
+    /// changes nothing.
     #[schema(min_length = 1, max_length = 256, value_type = Option<String>)]
     #[param(min_length = 1, max_length = 256, value_type = Option<String>, example = "drive7/000123.jpg")]
     #[serde(default)]
@@ -62,7 +63,9 @@ pub struct ReferenceParams {
 impl ReferenceParams {
     /// Checks what the types cannot.
     pub fn checked(self) -> Result<(MapName, ReferenceFields), ApiError> {
-        let map = self.map.ok_or_else(|| ApiError::invalid("map: it is required"))?;
+        let map = self
+            .map
+            .ok_or_else(|| ApiError::invalid("map: it is required"))?;
         let fields = ReferenceFields {
             external_id: self.external_id,
             location: point(self.lat, self.lon)?,
@@ -76,8 +79,9 @@ impl ReferenceParams {
 
 /// Add a photo to a map
 ///
-/// Acknowledged only after it is durable and can be found. The image is the raw body with the fields as query
-/// parameters, or a multipart part `image` beside a part `json`, or base64 in JSON beside the fields.
+/// Acknowledged only after it is durable and can be found. The image is the raw body with the
+/// fields as query parameters, or a multipart part `image` beside a part `json`, or base64 in JSON
+/// beside the fields.
 #[utoipa::path(post, path = "/references", operation_id = "create_reference", tag = "references", params(ReferenceParams), responses(
     (status = 201, description = "It is new, durable and can be found.", body = ReferenceBody,
         headers(("location" = String, description = "Its path."))),
@@ -144,7 +148,9 @@ impl ListParams {
     pub fn checked(self, max_page: usize) -> Result<Listing, ApiError> {
         let limit = self.limit.unwrap_or(DEFAULT_PAGE.min(max_page));
         if !(1..=max_page).contains(&limit) {
-            return Err(ApiError::invalid(format!("limit: {limit} is outside 1 to {max_page}")));
+            return Err(ApiError::invalid(format!(
+                "limit: {limit} is outside 1 to {max_page}"
+            )));
         }
         let after = self.cursor.as_deref().map(str::parse).transpose()?;
         match (self.map, self.external_id) {
@@ -170,13 +176,19 @@ pub struct ReferencePage {
 #[utoipa::path(get, path = "/references", operation_id = "list_references", tag = "references", params(ListParams), responses(
     (status = 200, description = "A page.", body = ReferencePage),
 ))]
-pub async fn list(State(state): State<AppState>, uri: Uri) -> Result<Json<ReferencePage>, ApiError> {
+pub async fn list(
+    State(state): State<AppState>,
+    uri: Uri,
+) -> Result<Json<ReferencePage>, ApiError> {
     let listing = read_query::<ListParams>(&uri)?.checked(state.http.max_page)?;
     let service = state.service()?;
     let (map, after, limit) = match listing {
         Listing::Named(map, external_id) => {
             let found = service.find_external(map, external_id).await?;
-            return Ok(Json(ReferencePage { references: found.into_iter().map(Into::into).collect(), next: None }));
+            return Ok(Json(ReferencePage {
+                references: found.into_iter().map(Into::into).collect(),
+                next: None,
+            }));
         }
         Listing::Page { map, after, limit } => (map, after, limit),
     };
@@ -188,7 +200,12 @@ pub async fn list(State(state): State<AppState>, uri: Uri) -> Result<Json<Refere
 }
 
 fn parse_id(text: &str) -> Result<ReferenceId, ApiError> {
-    let absent = |_| ApiError::new(ErrorCode::ReferenceNotFound, "the id in the path is not a UUID, so nothing has it");
+    let absent = |_| {
+        ApiError::new(
+            ErrorCode::ReferenceNotFound,
+            "the id in the path is not a UUID, so nothing has it",
+        )
+    };
     text.parse().map_err(absent)
 }
 
@@ -199,8 +216,13 @@ fn parse_id(text: &str) -> Result<ReferenceId, ApiError> {
     params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
     (status = 200, description = "The reference.", body = ReferenceBody),
 ))]
-pub async fn get(State(state): State<AppState>, Path(id): Path<String>) -> Result<Json<ReferenceBody>, ApiError> {
-    Ok(Json(state.service()?.reference(parse_id(&id)?).await?.into()))
+pub async fn get(
+    State(state): State<AppState>,
+    Path(id): Path<String>,
+) -> Result<Json<ReferenceBody>, ApiError> {
+    Ok(Json(
+        state.service()?.reference(parse_id(&id)?).await?.into(),
+    ))
 }
 
 /// Fields to change: one left out stays as it is, null clears it.
@@ -242,12 +264,19 @@ impl ReferenceChange {
         let location = match (self.lat, self.lon) {
             (None, None) => None,
             (Some(lat), Some(lon)) => Some(point(lat, lon)?),
-            _ => return Err(ApiError::invalid("lat and lon belong together: change both or neither")),
+            _ => {
+                return Err(ApiError::invalid(
+                    "lat and lon belong together: change both or neither",
+                ));
+            }
         };
         Ok(ReferencePatch {
             external_id: self.external_id,
             location,
-            heading: self.heading.map(|heading| heading.map(Heading::new).transpose()).transpose()?,
+            heading: self
+                .heading
+                .map(|heading| heading.map(Heading::new).transpose())
+                .transpose()?,
             captured_at: self.captured_at.map(|at| at.map(|Rfc3339(at)| at)),
             metadata: self.metadata,
         })
@@ -268,7 +297,9 @@ pub async fn update(
 ) -> Result<Json<ReferenceBody>, ApiError> {
     let id = parse_id(&id)?;
     let change: ReferenceChange = read_json(&state, request).await?;
-    Ok(Json(state.service()?.update(id, change.checked()?).await?.into()))
+    Ok(Json(
+        state.service()?.update(id, change.checked()?).await?.into(),
+    ))
 }
 
 /// Delete a reference
@@ -278,7 +309,10 @@ pub async fn update(
     params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
     (status = 204, description = "It is gone."),
 ))]
-pub async fn delete(State(state): State<AppState>, Path(id): Path<String>) -> Result<Response, ApiError> {
+pub async fn delete(
+    State(state): State<AppState>,
+    Path(id): Path<String>,
+) -> Result<Response, ApiError> {
     state.service()?.delete(parse_id(&id)?).await?;
     Ok(StatusCode::NO_CONTENT.into_response())
 }

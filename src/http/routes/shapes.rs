@@ -87,7 +87,9 @@ pub fn point(lat: Option<f64>, lon: Option<f64>) -> Result<Option<GeoPoint>, Api
     match (lat, lon) {
         (Some(lat), Some(lon)) => Ok(Some(GeoPoint::new(lat, lon)?)),
         (None, None) => Ok(None),
-        _ => Err(ApiError::invalid("lat and lon belong together: give both or neither")),
+        _ => Err(ApiError::invalid(
+            "lat and lon belong together: give both or neither",
+        )),
     }
 }
 
@@ -116,19 +118,23 @@ pub fn timed<T: Serialize>(body: T, timings: &Timings) -> Response {
 }
 
 /// Reads a JSON object, or a string that holds one (as in a query string).
-pub fn json_object<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Map<String, Value>>, D::Error> {
+pub fn json_object<'de, D: Deserializer<'de>>(
+    deserializer: D,
+) -> Result<Option<Map<String, Value>>, D::Error> {
     use serde::de::Error;
     match Option::<Value>::deserialize(deserializer)? {
         None | Some(Value::Null) => Ok(None),
         Some(Value::Object(object)) => Ok(Some(object)),
-        Some(Value::String(text)) => {
-            serde_json::from_str(&text).map(Some).map_err(|error| D::Error::custom(format!("metadata: {error}")))
-        }
+        Some(Value::String(text)) => serde_json::from_str(&text)
+            .map(Some)
+            .map_err(|error| D::Error::custom(format!("metadata: {error}"))),
         Some(_) => Err(D::Error::custom("metadata: it must be a JSON object")),
     }
 }
 
 /// Tells a field that is absent (`None`) from one that is null (`Some(None)`).
-pub fn present<'de, T: Deserialize<'de>, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Option<T>>, D::Error> {
+pub fn present<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
+    deserializer: D,
+) -> Result<Option<Option<T>>, D::Error> {
     Option::deserialize(deserializer).map(Some)
 }

@@ -1,12 +1,15 @@
-//! How the queries, keys and values of an image lie in memory, and how finished projections get there.
+//! How the queries, keys and values of an image lie in memory, and how finished projections get
+//! there.
 //!
-//! Keys and values lie as the two products read them, cut into chunks of [`chunk_rows`](super::chunk_rows) tokens so that
-//! each chunk can be written by the thread that computed it: keys `[chunk][head][key panel][words of head_dim][columns]`,
-//! values `[chunk][head][value panel][words of chunk_rows][columns]`, panels `columns` wide as in [`Tiling`].
+//! Keys and values lie as the two products read them, cut into chunks of
+//! [`chunk_rows`](super::chunk_rows) tokens so that each chunk can be written by the thread that
+//! computed it: keys `[chunk][head][key panel][words of head_dim][columns]`, values
+//! `[chunk][head][value panel][words of chunk_rows][columns]`, panels `columns` wide as in
+//! [`Tiling`].
 //!
-//! In int8 a query and a key have one factor for all dimensions of their head. A panel of keys ends in a row of factors
-//! and one of the offsets that the queries' 128 adds to sums; a chunk's queries end in their factors,
-//! `[head][chunk_rows]`.
+//! In int8 a query and a key have one factor for all dimensions of their head. A panel of keys ends
+//! in a row of factors and one of the offsets that the queries' 128 adds to sums; a chunk's queries
+//! end in their factors, `[head][chunk_rows]`.
 
 use crate::kernels::Simd;
 use crate::kernels::gemm::{Panel, Tiling, multiply_panel};
@@ -53,12 +56,20 @@ impl AttentionShape {
 
     /// Words of one chunk's queries and what their codes are worth.
     pub fn queries_len(&self) -> usize {
-        self.chunk_rows * (self.query_len() + if self.scores == Format::Int8 { self.heads } else { 0 })
+        self.chunk_rows
+            * (self.query_len()
+                + if self.scores == Format::Int8 {
+                    self.heads
+                } else {
+                    0
+                })
     }
 
     /// Where in a chunk's queries (`[chunk_rows, query_len]`) a block of their projection begins.
     pub fn query_at(&self, place: Place) -> usize {
-        place.token * self.query_len() + place.head * self.head_words() + self.scores.words(place.dim)
+        place.token * self.query_len()
+            + place.head * self.head_words()
+            + self.scores.words(place.dim)
     }
 
     /// Where in a chunk's queries the factor of a token's begins, if they have one.
@@ -103,11 +114,23 @@ pub struct Place {
 ///
 /// # Panics
 /// If `keys` is not a chunk of `shape`, or the place not the first of a panel.
-pub fn store_keys(simd: Simd, shape: &AttentionShape, place: Place, block: Rows<'_>, keys: &mut [u32]) {
+pub fn store_keys(
+    simd: Simd,
+    shape: &AttentionShape,
+    place: Place,
+    block: Rows<'_>,
+    keys: &mut [u32],
+) {
     let first = shape.scores.words(place.dim) * Tiling::of(simd).columns;
     for (rows, panel) in key_panels(simd, shape, place, block, keys) {
         let size = (rows.len() / block.stride, block.stride);
-        transpose(simd, (rows, block.stride), size, &mut panel[first..], Tiling::of(simd).columns);
+        transpose(
+            simd,
+            (rows, block.stride),
+            size,
+            &mut panel[first..],
+            Tiling::of(simd).columns,
+        );
     }
 }
 
@@ -123,21 +146,36 @@ fn key_panels<'a>(
     assert_eq!(keys.len(), shape.keys_len(), "not one chunk of keys");
     assert_eq!(place.token % columns, 0, "keys are written by whole panels");
     let head = &mut keys[place.head * shape.head_keys()..][..shape.head_keys()];
-    let panels = head.chunks_exact_mut(shape.panel_rows() * columns).skip(place.token / columns);
+    let panels = head
+        .chunks_exact_mut(shape.panel_rows() * columns)
+        .skip(place.token / columns);
     block.data.chunks(columns * block.stride).zip(panels)
 }
 
-/// Writes the queries of a head, rows `[n, head_dim]` of f32 whose first is the place's token, as codes to their places
-/// in a chunk's queries.
+/// Writes the queries of a head, rows `[n, head_dim]` of f32 whose first is the place's token, as
+/// codes to their places in a chunk's queries.
 ///
 /// # Panics
 /// If `queries` is not a chunk of `shape`, or the scores are not int8.
-pub fn store_query_codes(simd: Simd, shape: &AttentionShape, place: Place, rows: &[f32], queries: &mut [u32]) {
-    assert_eq!((shape.scores, queries.len()), (Format::Int8, shape.queries_len()), "not one chunk of codes");
+pub fn store_query_codes(
+    simd: Simd,
+    shape: &AttentionShape,
+    place: Place,
+    rows: &[f32],
+    queries: &mut [u32],
+) {
+    assert_eq!(
+        (shape.scores, queries.len()),
+        (Format::Int8, shape.queries_len()),
+        "not one chunk of codes"
+    );
     let (codes, factors) = queries.split_at_mut(shape.chunk_rows * shape.query_len());
     let factors = &mut factors[shape.query_factor_at(place.head, place.token) - codes.len()..];
     let factors = bytemuck::cast_slice_mut(&mut factors[..rows.len() / shape.head_dim]);
-    let codes = (&mut codes[shape.query_at(Place { dim: 0, ..place })..], shape.query_len());
+    let codes = (
+        &mut codes[shape.query_at(Place { dim: 0, ..place })..],
+        shape.query_len(),
+    );
     quantise_into(simd, shape.head_dim, (rows, shape.head_dim), codes, factors);
 }
 
@@ -179,7 +217,18 @@ fn store_offsets(simd: Simd, panel: Panel<'_>, offsets: &mut [u32]) {
     let tile = Tiling::of(simd);
     let mut sums = [0.0; 16 * 32];
     let sums = &mut sums[..tile.row_step * tile.columns];
-    multiply_panel(simd, Format::Int8, tile.row_step, Rows { data: &ZERO_QUERY, stride: 0 }, panel, sums, tile.columns);
+    multiply_panel(
+        simd,
+        Format::Int8,
+        tile.row_step,
+        Rows {
+            data: &ZERO_QUERY,
+            stride: 0,
+        },
+        panel,
+        sums,
+        tile.columns,
+    );
     offsets.copy_from_slice(bytemuck::cast_slice(&sums[..tile.columns]));
 }
 
@@ -187,7 +236,13 @@ fn store_offsets(simd: Simd, panel: Panel<'_>, offsets: &mut [u32]) {
 ///
 /// # Panics
 /// If `values` is not a chunk of `shape`.
-pub fn store_values(simd: Simd, shape: &AttentionShape, place: Place, block: Rows<'_>, values: &mut [u32]) {
+pub fn store_values(
+    simd: Simd,
+    shape: &AttentionShape,
+    place: Place,
+    block: Rows<'_>,
+    values: &mut [u32],
+) {
     let columns = Tiling::of(simd).columns;
     assert_eq!(values.len(), shape.values_len(), "not one chunk of values");
     let words = |tokens: usize| shape.mix.words(tokens);
@@ -196,7 +251,11 @@ pub fn store_values(simd: Simd, shape: &AttentionShape, place: Place, block: Row
     if shape.mix == Format::F32 {
         return panel[..block.data.len()].copy_from_slice(block.data);
     }
-    for (pair, out) in block.data.chunks_exact(2 * block.stride).zip(panel.chunks_exact_mut(columns)) {
+    for (pair, out) in block
+        .data
+        .chunks_exact(2 * block.stride)
+        .zip(panel.chunks_exact_mut(columns))
+    {
         let (first, second) = pair.split_at(block.stride);
         for ((out, first), second) in out.chunks_exact_mut(2).zip(first).zip(second) {
             out[0] = first & 0xffff | second << 16;
@@ -206,11 +265,26 @@ pub fn store_values(simd: Simd, shape: &AttentionShape, place: Place, block: Row
 }
 
 /// The query rows of one head from row `first` of a chunk's queries on.
-pub(super) fn head_queries<'a>(shape: &AttentionShape, head: usize, first: usize, queries: &'a [u32]) -> Left<'a> {
-    let at = shape.query_at(Place { head, dim: 0, token: first });
+pub(super) fn head_queries<'a>(
+    shape: &AttentionShape,
+    head: usize,
+    first: usize,
+    queries: &'a [u32],
+) -> Left<'a> {
+    let at = shape.query_at(Place {
+        head,
+        dim: 0,
+        token: first,
+    });
     let factors = match shape.scores {
         Format::Int8 => bytemuck::cast_slice(&queries[shape.query_factor_at(head, first)..]),
         _ => &[],
     };
-    Left { rows: Rows { data: &queries[at..], stride: shape.query_len() }, factors }
+    Left {
+        rows: Rows {
+            data: &queries[at..],
+            stride: shape.query_len(),
+        },
+        factors,
+    }
 }

@@ -1,18 +1,32 @@
 //! `exp2` and GELU by polynomials, in vectors.
 //!
-//! 2^f on [-0.5, 0.5] is a polynomial of degree 5 (relative error 1e-7), or 4 (3e-6) where the result is rounded to
-//! eight bits anyway. The normal distribution in GELU is 1/2 + x P(x^2) up to a limit, 0 or 1 beyond, with P of degree 13
-//! in x^2 mapped to [-1, 1] up to 5.3 (absolute error of GELU 8e-7), or 7 up to 4.2 (8e-5) where the next product has
-//! eight bits. All were fitted for the smallest maximal error; P is just 1 / (2 limit) at the limit, so that nothing has to
-//! be cut off there.
+//! 2^f on [-0.5, 0.5] is a polynomial of degree 5 (relative error 1e-7), or 4 (3e-6) where the
+//! result is rounded to eight bits anyway. The normal distribution in GELU is 1/2 + x P(x^2) up to
+//! a limit, 0 or 1 beyond, with P of degree 13 in x^2 mapped to [-1, 1] up to 5.3 (absolute error
+//! of GELU 8e-7), or 7 up to 4.2 (8e-5) where the next product has eight bits. All were fitted for
+//! the smallest maximal error; P is just 1 / (2 limit) at the limit, so that nothing has to be cut
+//! off there.
 
 use crate::kernels::lanes::{Lanes, ROUNDING};
 
 /// 2^f on [-0.5, 0.5], highest power first.
-pub(super) const EXP2: [f32; 6] = [0.001_327_647, 0.009_675_541, 0.055_507_135, 0.240_221_2, 0.693_146_94, 1.000_000_1];
+pub(super) const EXP2: [f32; 6] = [
+    0.001_327_647,
+    0.009_675_541,
+    0.055_507_135,
+    0.240_221_2,
+    0.693_146_94,
+    1.000_000_1,
+];
 
 /// The same for results that are rounded to eight bits.
-pub(super) const EXP2_SHORT: [f32; 5] = [0.009_570_101, 0.055_917_86, 0.240_247_44, 0.693_121_8, 0.999_999_3];
+pub(super) const EXP2_SHORT: [f32; 5] = [
+    0.009_570_101,
+    0.055_917_86,
+    0.240_247_44,
+    0.693_121_8,
+    0.999_999_3,
+];
 
 /// 2^x for x up to 127 by a polynomial of 2^f; smaller than -126 gives 2^-126, NaN stays NaN.
 #[inline(always)]
@@ -25,13 +39,19 @@ pub(super) unsafe fn exp2<V: Lanes>(x: V, polynomial: &[f32]) -> V {
     }
 }
 
-/// x times the normal distribution's share below x: x/2 + x^2 P(x^2), with x in P and before it kept to the limit.
+/// x times the normal distribution's share below x: x/2 + x^2 P(x^2), with x in P and before it
+/// kept to the limit.
 #[inline(always)]
-pub(super) unsafe fn gelu<V: Lanes, const N: usize>(x: V, (limit, polynomial): &(f32, [f32; N])) -> V {
+pub(super) unsafe fn gelu<V: Lanes, const N: usize>(
+    x: V,
+    (limit, polynomial): &(f32, [f32; N]),
+) -> V {
     // SAFETY: as in `exp2`.
     unsafe {
         let kept = V::splat(-limit).max(V::splat(*limit).min(x));
-        let mapped = kept.mul(kept).mul_add(V::splat(2.0 / (limit * limit)), V::splat(-1.0));
+        let mapped = kept
+            .mul(kept)
+            .mul_add(V::splat(2.0 / (limit * limit)), V::splat(-1.0));
         x.mul(kept.mul_add(horner(mapped, polynomial), V::splat(0.5)))
     }
 }

@@ -63,11 +63,29 @@ proptest! {
 fn a_product_over_nothing_is_zero() {
     for simd in Simd::all() {
         let tile = Tiling::of(simd);
-        for format in Format::ALL.into_iter().filter(|format| format.is_available(simd)) {
+        for format in Format::ALL
+            .into_iter()
+            .filter(|format| format.is_available(simd))
+        {
             let mut out = vec![7.0; tile.rows * tile.columns];
-            let left = Rows { data: &[], stride: 0 };
-            multiply_panel(simd, format, tile.rows, left, Panel::whole(&[], 0), &mut out, tile.columns);
-            assert!(out.iter().all(|&sum| sum == 0.0), "{format:?}, {}", simd.level());
+            let left = Rows {
+                data: &[],
+                stride: 0,
+            };
+            multiply_panel(
+                simd,
+                format,
+                tile.rows,
+                left,
+                Panel::whole(&[], 0),
+                &mut out,
+                tile.columns,
+            );
+            assert!(
+                out.iter().all(|&sum| sum == 0.0),
+                "{format:?}, {}",
+                simd.level()
+            );
         }
     }
 }
@@ -77,10 +95,23 @@ fn a_product_over_nothing_is_zero() {
 fn segments_across_each_other_are_refused() {
     let tile = Tiling::of(Simd::SCALAR);
     let data = vec![0; 10 * tile.columns];
-    let panel = Panel { data: &data, k: 11, segment_rows: 10, segment_stride: 0 };
+    let panel = Panel {
+        data: &data,
+        k: 11,
+        segment_rows: 10,
+        segment_stride: 0,
+    };
     let mut out = vec![0.0; tile.rows * tile.columns];
     let left = vec![0.0; tile.rows * 11];
-    multiply_panel(Simd::SCALAR, Format::F32, tile.rows, Rows::f32(&left, 11), panel, &mut out, tile.columns);
+    multiply_panel(
+        Simd::SCALAR,
+        Format::F32,
+        tile.rows,
+        Rows::f32(&left, 11),
+        panel,
+        &mut out,
+        tile.columns,
+    );
 }
 
 #[test]
@@ -88,5 +119,13 @@ fn segments_across_each_other_are_refused() {
 fn a_short_panel_is_refused() {
     let tile = Tiling::of(Simd::SCALAR);
     let (left, panel) = (Rows::f32(&[0.0; 64], 8), Panel::whole(&[0; 9], 8));
-    multiply_panel(Simd::SCALAR, Format::F32, tile.rows, left, panel, &mut [0.0; 64], 8);
+    multiply_panel(
+        Simd::SCALAR,
+        Format::F32,
+        tile.rows,
+        left,
+        panel,
+        &mut [0.0; 64],
+        8,
+    );
 }

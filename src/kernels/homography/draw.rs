@@ -1,8 +1,9 @@
 //! Random samples of four different correspondences, many at a time.
 //!
-//! The generator is SplitMix64 (Steele, Lea, Flood 2014): its numbers are part of every score, so they must never
-//! change with a library's version. Its state is a counter, so that the compiler can turn the loop over successive
-//! numbers into vectors; each number gives four positions, and samples that repeat one are passed over.
+//! The generator is SplitMix64 (Steele, Lea, Flood 2014): its numbers are part of every score, so
+//! they must never change with a library's version. Its state is a counter, so that the compiler
+//! can turn the loop over successive numbers into vectors; each number gives four positions, and
+//! samples that repeat one are passed over.
 
 use super::Sample;
 use crate::kernels::simd::Simd;
@@ -31,7 +32,12 @@ pub struct Sampler {
 impl Sampler {
     /// The sequence of `seed`.
     pub fn new(seed: u64) -> Self {
-        Self { counter: seed, ready: [[0; 4]; CHUNK], next: 0, len: 0 }
+        Self {
+            counter: seed,
+            ready: [[0; 4]; CHUNK],
+            next: 0,
+            len: 0,
+        }
     }
 
     /// Fills `samples` with the next of the sequence, over `points` correspondences.
@@ -48,7 +54,8 @@ impl Sampler {
                 self.refill(simd, points);
             }
             let count = (samples.len() - filled).min(self.len - self.next);
-            samples[filled..filled + count].copy_from_slice(&self.ready[self.next..self.next + count]);
+            samples[filled..filled + count]
+                .copy_from_slice(&self.ready[self.next..self.next + count]);
             filled += count;
             self.next += count;
         }
@@ -64,7 +71,9 @@ impl Sampler {
             },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            SimdLevel::Avx2 => unsafe { raw_avx2(self.counter, points, &mut positions, &mut different) },
+            SimdLevel::Avx2 => unsafe {
+                raw_avx2(self.counter, points, &mut positions, &mut different)
+            },
             _ => raw(self.counter, points, &mut positions, &mut different),
         }
         self.counter = self.counter.wrapping_add(STEP.wrapping_mul(CHUNK as u64));
@@ -83,7 +92,8 @@ fn fields(four: u64) -> Sample {
     bytemuck::cast::<u64, Sample>(four.to_le()).map(u16::from_le)
 }
 
-/// Four positions below `points` from each of the next numbers, and whether they differ (not zero if so).
+/// Four positions below `points` from each of the next numbers, and whether they differ (not zero
+/// if so).
 #[inline(always)]
 fn raw(counter: u64, points: u16, positions: &mut [u64; CHUNK], different: &mut [u64; CHUNK]) {
     for (i, four) in (1u64..).zip(positions.iter_mut()) {
@@ -92,17 +102,21 @@ fn raw(counter: u64, points: u16, positions: &mut [u64; CHUNK], different: &mut 
         let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         *four = mixed ^ (mixed >> 31);
     }
-    // On a machine of the other byte order the fields come in another order; they are put back by the same call.
+    // On a machine of the other byte order the fields come in another order; they are put back by
+    // the same call.
     positions.iter_mut().for_each(|four| *four = four.to_le());
     for field in bytemuck::cast_slice_mut::<u64, u16>(positions) {
         *field = ((u32::from(*field) * u32::from(points)) >> 16) as u16;
     }
-    positions.iter_mut().for_each(|four| *four = u64::from_le(*four));
+    positions
+        .iter_mut()
+        .for_each(|four| *four = u64::from_le(*four));
     for (different, four) in different.iter_mut().zip(positions.iter()) {
-        // Turning by one and by two fields brings each of the six pairs together; a pair of equals leaves a field of
-        // zeros. The borrow out of a field of zeros shows in its top bit; that it may run on does not matter, as the
-        // first is enough.
-        let zeros = |word: u64| word.wrapping_sub(0x0001_0001_0001_0001) & !word & 0x8000_8000_8000_8000;
+        // Turning by one and by two fields brings each of the six pairs together; a pair of equals
+        // leaves a field of zeros. The borrow out of a field of zeros shows in its top bit; that it
+        // may run on does not matter, as the first is enough.
+        let zeros =
+            |word: u64| word.wrapping_sub(0x0001_0001_0001_0001) & !word & 0x8000_8000_8000_8000;
         let equal = zeros(four ^ four.rotate_left(16)) | zeros(four ^ four.rotate_left(32));
         *different = u64::from(equal == 0);
     }
@@ -118,7 +132,12 @@ fn raw_avx2(counter: u64, points: u16, positions: &mut [u64; CHUNK], different: 
 /// The same again; DQ has the product of 64-bit words.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-fn raw_avx512(counter: u64, points: u16, positions: &mut [u64; CHUNK], different: &mut [u64; CHUNK]) {
+fn raw_avx512(
+    counter: u64,
+    points: u16,
+    positions: &mut [u64; CHUNK],
+    different: &mut [u64; CHUNK],
+) {
     raw(counter, points, positions, different);
 }
 
@@ -135,7 +154,8 @@ impl OneByOne {
             let mixed = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
             let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
             let bits = mixed ^ (mixed >> 31);
-            let four = [0, 16, 32, 48].map(|shift| (((bits >> shift & 0xffff) * points) >> 16) as u16);
+            let four =
+                [0, 16, 32, 48].map(|shift| (((bits >> shift & 0xffff) * points) >> 16) as u16);
             if (0..4).all(|i| (0..i).all(|j| four[i] != four[j])) {
                 return four;
             }
@@ -171,8 +191,14 @@ mod tests {
     fn every_position_is_drawn_and_four_always_differ() {
         let (mut sampler, mut samples) = (Sampler::new(7), vec![[0; 4]; 4000]);
         sampler.fill(Simd::best(), 37, &mut samples);
-        assert!(samples.iter().all(|four| (0..4).all(|i| four[i] < 37 && (0..i).all(|j| four[i] != four[j]))));
-        assert!((0..37).all(|position| (0..4).all(|corner| samples.iter().any(|four| four[corner] == position))));
+        assert!(
+            samples
+                .iter()
+                .all(|four| (0..4).all(|i| four[i] < 37 && (0..i).all(|j| four[i] != four[j])))
+        );
+        assert!((0..37).all(|position| {
+            (0..4).all(|corner| samples.iter().any(|four| four[corner] == position))
+        }));
     }
 
     #[test]

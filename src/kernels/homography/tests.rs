@@ -28,7 +28,11 @@ fn four_corners_give_their_homography_with_positive_scale() {
     let square = [[0.0, 0.0], [30.0, 2.0], [28.0, 25.0], [-3.0, 22.0]];
     for order in [[0, 1, 2, 3], [3, 2, 1, 0], [0, 2, 1, 3]] {
         let (pairs, samples) = one_sample(moved(order.map(|i| square[i])));
-        assert_eq!(proper(Simd::SCALAR, &pairs, &samples, 0.01), 0xffff, "{order:?}");
+        assert_eq!(
+            proper(Simd::SCALAR, &pairs, &samples, 0.01),
+            0xffff,
+            "{order:?}"
+        );
         let h = solve(Simd::SCALAR, &pairs, &samples).get(0);
         assert!(h[8] > 0.0);
         for (ours, truth) in h.iter().zip(TRUE) {
@@ -60,7 +64,10 @@ fn each_sample_has_its_own_bit_and_lane() {
     let mut samples = [[0; 4]; LANES];
     Sampler::new(5).fill(Simd::SCALAR, 64, &mut samples);
     for simd in Simd::all() {
-        let (bits, solved) = (proper(simd, &pairs, &samples, 0.1), solve(simd, &pairs, &samples));
+        let (bits, solved) = (
+            proper(simd, &pairs, &samples, 0.1),
+            solve(simd, &pairs, &samples),
+        );
         for (lane, sample) in samples.iter().enumerate() {
             let alone = [*sample; LANES];
             assert_eq!(proper(simd, &pairs, &alone, 0.1) & 1, bits >> lane & 1);
@@ -73,7 +80,12 @@ fn each_sample_has_its_own_bit_and_lane() {
 #[test]
 fn inliers_lie_within_one_unit_and_in_front() {
     let mut pairs = PointPairs::default();
-    pairs.fill([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.01, 0.0], [5.0, 5.0, 5.6, 5.7], [9.0, 9.0, 9.8, 9.8]]);
+    pairs.fill([
+        [0.0, 0.0, 1.0, 0.0],
+        [0.0, 0.0, 1.01, 0.0],
+        [5.0, 5.0, 5.6, 5.7],
+        [9.0, 9.0, 9.8, 9.8],
+    ]);
     let identity = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
     let behind = identity.map(|entry: f32| -entry);
     for simd in Simd::all() {
@@ -87,9 +99,20 @@ fn counting_sees_every_correspondence_once_however_many_there_are() {
     let identity = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
     for n in 0..200usize {
         let mut pairs = PointPairs::default();
-        pairs.fill((0..n).map(|i| [i as f32, 0.0, i as f32 + if i % 3 == 0 { 0.0 } else { 5.0 }, 0.0]));
+        pairs.fill((0..n).map(|i| {
+            [
+                i as f32,
+                0.0,
+                i as f32 + if i % 3 == 0 { 0.0 } else { 5.0 },
+                0.0,
+            ]
+        }));
         for simd in Simd::all() {
-            assert_eq!(count_inliers(simd, &pairs, &identity, 0), n.div_ceil(3), "{n}");
+            assert_eq!(
+                count_inliers(simd, &pairs, &identity, 0),
+                n.div_ceil(3),
+                "{n}"
+            );
         }
         let mut xs = pairs.coordinates[0][..n].to_vec();
         xs.sort_by(f32::total_cmp);

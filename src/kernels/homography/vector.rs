@@ -1,4 +1,5 @@
-//! What the kernels of homographies need of a vector of f32 beyond [`Lanes`], at each level beyond the portable one.
+//! What the kernels of homographies need of a vector of f32 beyond [`Lanes`], at each level beyond
+//! the portable one.
 
 use super::Sample;
 use crate::kernels::lanes::{Avx2, Avx512, Lanes};
@@ -7,8 +8,8 @@ use std::arch::x86_64::*;
 /// Division, bits, and masks of one bit per element.
 ///
 /// # Safety
-/// Every method may be called only where the level's instructions are available; pointers must be valid for `COUNT`
-/// elements.
+/// Every method may be called only where the level's instructions are available; pointers must be
+/// valid for `COUNT` elements.
 pub(super) trait Vector: Lanes {
     unsafe fn div(self, other: Self) -> Self;
     unsafe fn abs(self) -> Self;
@@ -29,11 +30,15 @@ pub(super) trait Vector: Lanes {
     unsafe fn corners(pairs: *const [f32; 4], samples: *const Sample, corner: usize) -> [Self; 4];
 }
 
-/// The correspondence at one corner of a sample. A macro, since the compiler may leave a closure out of line, where it
-/// lacks the level's instructions.
+/// The correspondence at one corner of a sample. A macro, since the compiler may leave a closure
+/// out of line, where it lacks the level's instructions.
 macro_rules! pair {
     ($pairs:ident, $samples:ident, $sample:expr, $corner:ident) => {
-        _mm_loadu_ps($pairs.add(usize::from((*$samples.add($sample))[$corner])).cast())
+        _mm_loadu_ps(
+            $pairs
+                .add(usize::from((*$samples.add($sample))[$corner]))
+                .cast(),
+        )
     };
 }
 
@@ -84,9 +89,11 @@ impl Vector for Avx2 {
     }
     #[inline(always)]
     unsafe fn corners(pairs: *const [f32; 4], samples: *const Sample, corner: usize) -> [Self; 4] {
-        // SAFETY: AVX2 is available; the caller vouches for eight samples and for the positions in them.
+        // SAFETY: AVX2 is available; the caller vouches for eight samples and for the positions in
+        // them.
         unsafe {
-            // Register `i` holds the pairs of samples i and i + 4, so that transposing within halves is enough.
+            // Register `i` holds the pairs of samples i and i + 4, so that transposing within
+            // halves is enough.
             macro_rules! two {
                 ($i:literal) => {
                     _mm256_insertf128_ps::<1>(
@@ -149,15 +156,18 @@ impl Vector for Avx512 {
         // SAFETY: AVX-512 is available.
         unsafe {
             let positive = _mm512_cmp_ps_mask::<_CMP_GT_OQ>(factor.0, _mm512_setzero_ps());
-            u32::from(_mm512_mask_cmp_ps_mask::<_CMP_LE_OQ>(positive, self.0, other.0))
+            u32::from(_mm512_mask_cmp_ps_mask::<_CMP_LE_OQ>(
+                positive, self.0, other.0,
+            ))
         }
     }
     #[inline(always)]
     unsafe fn corners(pairs: *const [f32; 4], samples: *const Sample, corner: usize) -> [Self; 4] {
-        // SAFETY: AVX-512 is available; the caller vouches for sixteen samples and for the positions in them.
+        // SAFETY: AVX-512 is available; the caller vouches for sixteen samples and for the
+        // positions in them.
         unsafe {
-            // Register `i` holds the pairs of samples i, i + 4, i + 8 and i + 12, so that transposing within quarters
-            // is enough.
+            // Register `i` holds the pairs of samples i, i + 4, i + 8 and i + 12, so that
+            // transposing within quarters is enough.
             macro_rules! four {
                 ($i:literal) => {{
                     let one = _mm512_castps128_ps512(pair!(pairs, samples, $i, corner));

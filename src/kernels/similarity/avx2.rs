@@ -1,7 +1,8 @@
 //! AVX2: tiles of 6 rows by 16 columns, products by `vpmaddwd` on codes widened to i16.
 //!
-//! `vpmaddubsw` would take twice the products per instruction, but it saturates, so that exactness costs back a sign
-//! transfer and a second widening multiplication; per exact product both need the same slots of the multiplier ports.
+//! `vpmaddubsw` would take twice the products per instruction, but it saturates, so that exactness
+//! costs back a sign transfer and a second widening multiplication; per exact product both need the
+//! same slots of the multiplier ports.
 
 use super::driver::{self, Level};
 use super::{BlockMaxima, Blocks, Line, PackedColumns, Quantised, SECTIONS, Scratch};
@@ -10,7 +11,8 @@ use std::arch::x86_64::*;
 
 /// Columns of a panel: two vectors.
 const PANEL: usize = 16;
-/// Rows of a tile: 6 x 2 accumulators, two column vectors, a row value and a product fill the 16 registers.
+/// Rows of a tile: 6 x 2 accumulators, two column vectors, a row value and a product fill the 16
+/// registers.
 const TILE: usize = 6;
 /// Rows of a tile where fewer than [`TILE`] are left.
 const STEP: usize = 2;
@@ -21,7 +23,9 @@ pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
     let depth = dim.div_ceil(2);
     packed.pack_factors(columns, PANEL);
     packed.pairs.clear();
-    packed.pairs.resize(packed.factors.len() / PANEL * depth, Line([0; 32]));
+    packed
+        .pairs
+        .resize(packed.factors.len() / PANEL * depth, Line([0; 32]));
     let mut panel_base = 0;
     for section in 0..SECTIONS {
         for local in 0..columns.counts[section] {
@@ -42,7 +46,9 @@ pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
 fn widen(rows: Quantised<'_>, scratch: &mut Scratch) {
     scratch.wide.clear();
     if rows.dim.is_multiple_of(2) {
-        scratch.wide.extend(rows.codes.iter().map(|&code| i16::from(code)));
+        scratch
+            .wide
+            .extend(rows.codes.iter().map(|&code| i16::from(code)));
     } else {
         for row in rows.codes.chunks_exact(rows.dim) {
             scratch.wide.extend(row.iter().map(|&code| i16::from(code)));
@@ -108,7 +114,8 @@ impl Level for Avx2 {
         const { assert!(ROWS <= TILE && VECTORS <= 2) };
         let stride = 2 * panel.len();
         for (k, line) in panel.iter().enumerate() {
-            // SAFETY: a line holds 64 bytes; row `r` has values up to `stride`, and 2k + 1 < stride.
+            // SAFETY: a line holds 64 bytes; row `r` has values up to `stride`, and 2k + 1 <
+            // stride.
             unsafe {
                 let columns = line.0.as_ptr().cast::<__m256i>();
                 // Written out: with a loop over rows the compiler keeps the sums in memory.
@@ -143,7 +150,12 @@ impl Level for Avx2 {
     #[inline(always)]
     unsafe fn indices_from(first: i32) -> __m256i {
         // SAFETY: the caller vouches for AVX2.
-        unsafe { _mm256_add_epi32(_mm256_set1_epi32(first), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7)) }
+        unsafe {
+            _mm256_add_epi32(
+                _mm256_set1_epi32(first),
+                _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7),
+            )
+        }
     }
 
     #[inline(always)]
@@ -159,7 +171,12 @@ impl Level for Avx2 {
     }
 
     #[inline(always)]
-    unsafe fn challenge(value: &mut lanes::Avx2, index: &mut __m256i, new_value: lanes::Avx2, new_index: __m256i) {
+    unsafe fn challenge(
+        value: &mut lanes::Avx2,
+        index: &mut __m256i,
+        new_value: lanes::Avx2,
+        new_index: __m256i,
+    ) {
         // SAFETY: the caller vouches for AVX2.
         unsafe {
             let better = _mm256_cmp_ps::<_CMP_GT_OQ>(new_value.0, value.0);

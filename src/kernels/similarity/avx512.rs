@@ -1,8 +1,8 @@
 //! AVX-512 VNNI: tiles of 12 rows by 32 columns, products by `vpdpbusd`.
 //!
-//! The instruction multiplies unsigned by signed bytes, so columns are offset by 128, once for all candidates, and sums
-//! start at -128 times that of a row's codes. Written on a CPU without it: [`super::check`] must pass before this level
-//! is used.
+//! The instruction multiplies unsigned by signed bytes, so columns are offset by 128, once for all
+//! candidates, and sums start at -128 times that of a row's codes. Written on a CPU without it:
+//! [`super::check`] must pass before this level is used.
 
 use super::driver::{self, Level};
 use super::{BlockMaxima, Blocks, Line, PackedColumns, Quantised, SECTIONS, Scratch};
@@ -20,13 +20,16 @@ const LANES: usize = 16;
 /// What makes a signed code an unsigned one: added, or as the highest bit turned around.
 const OFFSET: u8 = 128;
 
-/// Lays columns out in panels: lines `2k` and `2k + 1` hold values `4k..4k + 4` of the first and last 16 columns.
+/// Lays columns out in panels: lines `2k` and `2k + 1` hold values `4k..4k + 4` of the first and
+/// last 16 columns.
 pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
     let dim = columns.dim;
     let depth = dim.div_ceil(4);
     packed.pack_factors(columns, PANEL);
     packed.quads.clear();
-    packed.quads.resize(packed.factors.len() / PANEL * depth * 2, Line([OFFSET; 64]));
+    packed
+        .quads
+        .resize(packed.factors.len() / PANEL * depth * 2, Line([OFFSET; 64]));
     let mut panel_base = 0;
     for section in 0..SECTIONS {
         for local in 0..columns.counts[section] {
@@ -34,7 +37,10 @@ pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
             let (panel, column) = (panel_base + local / PANEL, local % PANEL);
             let lines = &mut packed.quads[panel * depth * 2..][..depth * 2];
             for (pair, quad) in lines.chunks_exact_mut(2).zip(codes.chunks(4)) {
-                for (slot, &code) in pair[column / LANES].0[column % LANES * 4..].iter_mut().zip(quad) {
+                for (slot, &code) in pair[column / LANES].0[column % LANES * 4..]
+                    .iter_mut()
+                    .zip(quad)
+                {
                     *slot = code as u8 ^ OFFSET;
                 }
             }
@@ -43,17 +49,23 @@ pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
     }
 }
 
-/// Sums of the rows, from which follows what the offset of the columns adds to a product; and the rows padded to whole
-/// fours, if need be.
+/// Sums of the rows, from which follows what the offset of the columns adds to a product; and the
+/// rows padded to whole fours, if need be.
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni")]
 fn lay_out(rows: Quantised<'_>, scratch: &mut Scratch) {
     scratch.starts.clear();
-    scratch.starts.extend(rows.codes.chunks_exact(rows.dim).map(|row| -i32::from(OFFSET) * sum(row)));
+    scratch.starts.extend(
+        rows.codes
+            .chunks_exact(rows.dim)
+            .map(|row| -i32::from(OFFSET) * sum(row)),
+    );
     scratch.padded.clear();
     if !rows.dim.is_multiple_of(4) {
         for row in rows.codes.chunks_exact(rows.dim) {
             scratch.padded.extend_from_slice(row);
-            scratch.padded.resize(scratch.padded.len().next_multiple_of(4), 0);
+            scratch
+                .padded
+                .resize(scratch.padded.len().next_multiple_of(4), 0);
         }
     }
 }
@@ -100,7 +112,11 @@ impl Level for Avx512 {
 
     #[inline(always)]
     fn rows<'a>(rows: Quantised<'a>, scratch: &'a Scratch) -> &'a [i8] {
-        if rows.dim.is_multiple_of(4) { rows.codes } else { &scratch.padded }
+        if rows.dim.is_multiple_of(4) {
+            rows.codes
+        } else {
+            &scratch.padded
+        }
     }
 
     #[inline(always)]
@@ -181,7 +197,12 @@ impl Level for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn challenge(value: &mut lanes::Avx512, index: &mut __m512i, new_value: lanes::Avx512, new_index: __m512i) {
+    unsafe fn challenge(
+        value: &mut lanes::Avx512,
+        index: &mut __m512i,
+        new_value: lanes::Avx512,
+        new_index: __m512i,
+    ) {
         // SAFETY: the caller vouches for AVX-512.
         unsafe {
             let better = _mm512_cmp_ps_mask::<_CMP_GT_OQ>(new_value.0, value.0);

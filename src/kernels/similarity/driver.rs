@@ -1,7 +1,9 @@
-//! The way through panels of columns and tiles of rows, written once for the levels that have vectors.
+//! The way through panels of columns and tiles of rows, written once for the levels that have
+//! vectors.
 //!
-//! A panel is two vectors of columns wide, or one where no more are left. It stays in the first-level cache while all tiles of rows pass by; the
-//! running maxima of its columns stay in registers, those of the rows are kept lane by lane and reduced at the end.
+//! A panel is two vectors of columns wide, or one where no more are left. It stays in the
+//! first-level cache while all tiles of rows pass by; the running maxima of its columns stay in
+//! registers, those of the rows are kept lane by lane and reduced at the end.
 
 use super::{Best, BlockMaxima, Blocks, MOST_LANES, PackedColumns, Quantised, SECTIONS, Scratch};
 use crate::kernels::lanes::Lanes;
@@ -10,8 +12,8 @@ use std::ops::Range;
 /// What differs between the levels.
 ///
 /// # Safety
-/// Methods that are `unsafe` may be called only where the level's instructions are available; pointers must be valid
-/// for a vector's elements.
+/// Methods that are `unsafe` may be called only where the level's instructions are available;
+/// pointers must be valid for a vector's elements.
 pub(super) trait Level {
     /// A row's element as it is multiplied.
     type Code;
@@ -24,7 +26,8 @@ pub(super) trait Level {
 
     /// Prepares the rows.
     unsafe fn lay_out(rows: Quantised<'_>, scratch: &mut Scratch);
-    /// The rows as laid out, each [`lines_per_panel`](Self::lines_per_panel) times two elements long.
+    /// The rows as laid out, each [`lines_per_panel`](Self::lines_per_panel) times two elements
+    /// long.
     fn rows<'a>(rows: Quantised<'a>, scratch: &'a Scratch) -> &'a [Self::Code];
     /// The packed columns.
     fn lines(columns: &PackedColumns) -> &[Self::Line];
@@ -32,8 +35,8 @@ pub(super) trait Level {
     fn lines_per_panel(dim: usize) -> usize;
     /// What the sums of row `row` start from.
     unsafe fn start(scratch: &Scratch, row: usize) -> Self::Integers;
-    /// Adds to `sums` the products of `ROWS` rows, `2 * panel.len()` elements apart, with the first `VECTORS` vectors of
-    /// columns of a panel.
+    /// Adds to `sums` the products of `ROWS` rows, `2 * panel.len()` elements apart, with the first
+    /// `VECTORS` vectors of columns of a panel.
     ///
     /// # Safety
     /// `rows` must point at `2 * ROWS * panel.len()` readable elements.
@@ -57,8 +60,8 @@ pub(super) trait Level {
     );
 }
 
-/// See [`super::block_maxima`], which has checked the lengths. Tiles are `TILE` rows high, and `STEP` where fewer are
-/// left.
+/// See [`super::block_maxima`], which has checked the lengths. Tiles are `TILE` rows high, and
+/// `STEP` where fewer are left.
 ///
 /// # Safety
 /// The level's instructions must be available.
@@ -89,7 +92,8 @@ pub(super) unsafe fn block_maxima<L: Level, const TILE: usize, const STEP: usize
             for row_section in 0..SECTIONS {
                 if wanted[row_section][column_section] {
                     let bests = &mut out.columns[row_section][view.first_column..][..left];
-                    let range = rows.start(row_section)..rows.start(row_section) + rows.counts[row_section];
+                    let range =
+                        rows.start(row_section)..rows.start(row_section) + rows.counts[row_section];
                     // SAFETY: the caller's.
                     unsafe {
                         if left > L::Floats::COUNT {
@@ -124,8 +128,8 @@ struct ColumnBests<L: Level, const VECTORS: usize> {
 
 /// Runs the first `VECTORS` vectors of a panel over the rows of one section.
 ///
-/// The last tile ends with the last row: it may see rows again, which changes nothing, since a maximum does not beat
-/// itself.
+/// The last tile ends with the last row: it may see rows again, which changes nothing, since a
+/// maximum does not beat itself.
 ///
 /// # Safety
 /// The level's instructions must be available.
@@ -175,14 +179,17 @@ unsafe fn tile_maxima<L: Level, const ROWS: usize, const VECTORS: usize>(
     let codes = L::rows(rows, scratch)[first_row * stride..(first_row + ROWS) * stride].as_ptr();
     let row_factors = &rows.factors[first_row..first_row + ROWS];
     assert!(panel.factors.len() == 2 * L::Floats::COUNT);
-    // SAFETY: the slice above holds `ROWS` rows of `stride` elements, `factors` two vectors. The instructions are the
-    // caller's.
+    // SAFETY: the slice above holds `ROWS` rows of `stride` elements, `factors` two vectors. The
+    // instructions are the caller's.
     unsafe {
         let mut sums: [[L::Integers; VECTORS]; ROWS] =
             std::array::from_fn(|r| [L::start(scratch, first_row + r); VECTORS]);
         L::add_products::<ROWS, VECTORS>(codes, panel.lines, &mut sums);
         let lanes = first_row * L::Floats::COUNT..(first_row + ROWS) * L::Floats::COUNT;
-        let (lane_values, lane_indices) = (&mut scratch.lane_values[lanes.clone()], &mut scratch.lane_indices[lanes]);
+        let (lane_values, lane_indices) = (
+            &mut scratch.lane_values[lanes.clone()],
+            &mut scratch.lane_indices[lanes],
+        );
         for (r, sums) in sums.iter().enumerate() {
             let row_factor = L::Floats::splat(row_factors[r]);
             let row_index = L::splat_index((first_row + r) as i32);
@@ -194,9 +201,16 @@ unsafe fn tile_maxima<L: Level, const ROWS: usize, const VECTORS: usize>(
             let (mut value, mut index) = (L::Floats::load(values_at), L::load_indices(indices_at));
             for vector in 0..VECTORS {
                 let dot = L::to_floats(sums[vector]);
-                let factors = L::Floats::load(panel.factors.as_ptr().add(vector * L::Floats::COUNT));
-                let columns = L::indices_from((panel.first_column + vector * L::Floats::COUNT) as i32);
-                L::challenge(&mut found.values[vector], &mut found.indices[vector], dot.mul(row_factor), row_index);
+                let factors =
+                    L::Floats::load(panel.factors.as_ptr().add(vector * L::Floats::COUNT));
+                let columns =
+                    L::indices_from((panel.first_column + vector * L::Floats::COUNT) as i32);
+                L::challenge(
+                    &mut found.values[vector],
+                    &mut found.indices[vector],
+                    dot.mul(row_factor),
+                    row_index,
+                );
                 L::challenge(&mut value, &mut index, dot.mul(factors), columns);
             }
             value.store(values_at);
@@ -212,7 +226,10 @@ impl<L: Level, const VECTORS: usize> ColumnBests<L, VECTORS> {
     unsafe fn none() -> Self {
         // SAFETY: the caller's.
         unsafe {
-            Self { values: [L::Floats::splat(f32::NEG_INFINITY); VECTORS], indices: [L::splat_index(-1); VECTORS] }
+            Self {
+                values: [L::Floats::splat(f32::NEG_INFINITY); VECTORS],
+                indices: [L::splat_index(-1); VECTORS],
+            }
         }
     }
 
@@ -229,11 +246,17 @@ impl<L: Level, const VECTORS: usize> ColumnBests<L, VECTORS> {
             // SAFETY: both arrays hold the vectors; the rest is the caller's.
             unsafe {
                 self.values[vector].store(values.as_mut_ptr().add(vector * L::Floats::COUNT));
-                L::store_indices(rows.as_mut_ptr().add(vector * L::Floats::COUNT), self.indices[vector]);
+                L::store_indices(
+                    rows.as_mut_ptr().add(vector * L::Floats::COUNT),
+                    self.indices[vector],
+                );
             }
         }
         for (best, (&value, &row)) in bests.iter_mut().zip(values.iter().zip(&rows)) {
-            *best = Best { value, index: row as u32 };
+            *best = Best {
+                value,
+                index: row as u32,
+            };
         }
     }
 }

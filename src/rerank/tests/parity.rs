@@ -24,15 +24,25 @@ fn matches_of_photographs_have_on_average_at_least_the_inliers_of_opencv() {
     assert_eq!(matches.tolerance_px, super::SETTINGS.tolerance_px);
     for same_place in [true, false] {
         let (mut ours, mut theirs, mut problems) = (0, 0, 0);
-        for problem in matches.problems.iter().filter(|problem| problem.same_place == same_place) {
+        for problem in matches
+            .problems
+            .iter()
+            .filter(|problem| problem.same_place == same_place)
+        {
             let (points, rest) = problem.points.as_chunks::<4>();
             assert!(rest.is_empty());
-            let points: Vec<_> = points.iter().map(|p| p.map(|value| f32::from(value) * matches.unit_px)).collect();
+            let points: Vec<_> = points
+                .iter()
+                .map(|p| p.map(|value| f32::from(value) * matches.unit_px))
+                .collect();
             ours += estimate(&points).map_or(0, |found| found.inliers);
             theirs += problem.opencv_inliers;
             problems += 1;
         }
         println!("same place {same_place}: {problems} problems, {ours} inliers, OpenCV {theirs}");
-        assert!(problems > 50 && ours >= theirs, "same place {same_place}: {ours} inliers, OpenCV {theirs}");
+        assert!(
+            problems > 50 && ours >= theirs,
+            "same place {same_place}: {ours} inliers, OpenCV {theirs}"
+        );
     }
 }

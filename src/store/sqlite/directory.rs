@@ -1,11 +1,13 @@
 //! The data directory: who may use it, and what keeps it usable when the disk is full.
 //!
-//! One process at a time holds an advisory lock on `LOCK`; the system drops it with the process, however that ends.
+//! One process at a time holds an advisory lock on `LOCK`; the system drops it with the process,
+//! however that ends.
 //!
-//! Even deleting needs room, for the log must grow before the database can shrink. So a file of zeros, `reserve`, is
-//! kept beside the database. When a delete finds the disk full the reserve is given up; until it can be restored
-//! nothing new is taken in, so that the room serves deletes only. The log is checkpointed at a quarter of the
-//! reserve's size, so that giving up the reserve always leaves room to fold the log into the database.
+//! Even deleting needs room, for the log must grow before the database can shrink. So a file of
+//! zeros, `reserve`, is kept beside the database. When a delete finds the disk full the reserve is
+//! given up; until it can be restored nothing new is taken in, so that the room serves deletes
+//! only. The log is checkpointed at a quarter of the reserve's size, so that giving up the reserve
+//! always leaves room to fold the log into the database.
 
 use crate::store::{StoreConfig, StoreError};
 use std::fs::{File, OpenOptions};
@@ -21,13 +23,19 @@ fn io(context: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Stor
     let path = path.to_owned();
     move |source| match source.kind() {
         ErrorKind::StorageFull | ErrorKind::QuotaExceeded => StoreError::DiskFull,
-        _ => StoreError::Io { context, path, source },
+        _ => StoreError::Io {
+            context,
+            path,
+            source,
+        },
     }
 }
 
 /// Syncs a directory, so that names created or renamed in it survive a power cut.
 pub(super) fn sync(directory: &Path) -> Result<(), StoreError> {
-    File::open(directory).and_then(|file| file.sync_all()).map_err(io("cannot sync directory", directory))
+    File::open(directory)
+        .and_then(|file| file.sync_all())
+        .map_err(io("cannot sync directory", directory))
 }
 
 /// The locked data directory; unlocked when dropped.
@@ -54,14 +62,22 @@ impl DataDirectory {
                 let mut holder = String::new();
                 // Who holds it is a courtesy; that it is held is certain.
                 let _ = (&lock).take(100).read_to_string(&mut holder);
-                return Err(StoreError::Locked { directory: path.to_owned(), holder: holder.trim().to_owned() });
+                return Err(StoreError::Locked {
+                    directory: path.to_owned(),
+                    holder: holder.trim().to_owned(),
+                });
             }
-            Err(std::fs::TryLockError::Error(source)) => return Err(io("cannot lock", &lock_path)(source)),
+            Err(std::fs::TryLockError::Error(source)) => {
+                return Err(io("cannot lock", &lock_path)(source));
+            }
         }
         // On a full disk the name of the holder may not fit; the lock holds all the same.
         let _ = lock.set_len(0).and_then(|()| lock.rewind());
         let _ = write!(lock, "process {}", std::process::id());
-        Ok(Self { _lock: lock, path: path.to_owned() })
+        Ok(Self {
+            _lock: lock,
+            path: path.to_owned(),
+        })
     }
 
     pub(super) fn database(&self) -> PathBuf {
@@ -77,13 +93,19 @@ pub(super) struct Reserve {
 }
 
 impl Reserve {
-    /// Takes the reserve: as configured, but never more than a quarter of what the disk has left (or of what an
-    /// earlier reserve already holds plus that).
+    /// Takes the reserve: as configured, but never more than a quarter of what the disk has left
+    /// (or of what an earlier reserve already holds plus that).
     pub(super) fn take(directory: &Path, config: &StoreConfig) -> Result<Self, StoreError> {
         let path = directory.join(RESERVE);
         let there = std::fs::metadata(&path).map(|meta| meta.len()).unwrap_or(0);
-        let bytes = config.reserve_bytes.min(((available(directory)? + there) / 4).max(there));
-        let mut reserve = Self { path, bytes, held: there >= bytes };
+        let bytes = config
+            .reserve_bytes
+            .min(((available(directory)? + there) / 4).max(there));
+        let mut reserve = Self {
+            path,
+            bytes,
+            held: there >= bytes,
+        };
         reserve.restore();
         Ok(reserve)
     }
@@ -101,7 +123,10 @@ impl Reserve {
     /// Gives the room up.
     pub(super) fn release(&mut self) {
         if self.held {
-            tracing::warn!(bytes = self.bytes, "the disk is full: giving up the reserve so that deletes succeed");
+            tracing::warn!(
+                bytes = self.bytes,
+                "the disk is full: giving up the reserve so that deletes succeed"
+            );
         }
         self.held = false;
         if let Err(error) = std::fs::remove_file(&self.path)
@@ -122,8 +147,8 @@ impl Reserve {
         self.held
     }
 
-    /// Takes the room in full, or at least half of it: what deletes have freed inside the database does not show as
-    /// free on the disk, and half is still twice the log.
+    /// Takes the room in full, or at least half of it: what deletes have freed inside the database
+    /// does not show as free on the disk, and half is still twice the log.
     fn fill(&self) -> std::io::Result<()> {
         let free = available_bytes(self.path.parent().unwrap_or(Path::new(".")))?;
         // The log must be able to grow beside it, or taking the reserve is what fills the disk.
@@ -162,7 +187,9 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let first = DataDirectory::claim(directory.path()).unwrap();
         match DataDirectory::claim(directory.path()) {
-            Err(StoreError::Locked { holder, .. }) => assert_eq!(holder, format!("process {}", std::process::id())),
+            Err(StoreError::Locked { holder, .. }) => {
+                assert_eq!(holder, format!("process {}", std::process::id()))
+            }
             other => panic!("{:?}", other.err()),
         }
         drop(first);
@@ -172,7 +199,10 @@ mod tests {
     #[test]
     fn the_reserve_comes_and_goes() {
         let directory = tempfile::tempdir().unwrap();
-        let config = StoreConfig { reserve_bytes: 3 << 20, ..StoreConfig::default() };
+        let config = StoreConfig {
+            reserve_bytes: 3 << 20,
+            ..StoreConfig::default()
+        };
         let mut reserve = Reserve::take(directory.path(), &config).unwrap();
         let file = directory.path().join(RESERVE);
         assert!(reserve.held() && file.metadata().unwrap().len() == 3 << 20);

@@ -1,16 +1,19 @@
-//! Storing a reference: its map on first use, its row, and the three parts of its descriptor, in one transaction.
+//! Storing a reference: its map on first use, its row, and the three parts of its descriptor, in
+//! one transaction.
 //!
-//! All inserts pass through the one writer, so that of two callers with one external id exactly one creates it.
+//! All inserts pass through the one writer, so that of two callers with one external id exactly one
+//! creates it.
 
 use super::engine::failed;
 use super::purge;
 use super::rows::{
-    self, MapRow, ReferenceRow, RowError, as_stored, global_checksum, patches_checksum, pooled_checksum, to_micros,
+    self, MapRow, ReferenceRow, RowError, as_stored, global_checksum, patches_checksum,
+    pooled_checksum, to_micros,
 };
 use crate::store::{Inserted, StoreError, codec, crash_points};
 use crate::types::{
-    ContentHash, Descriptor, ExternalId, GLOBAL_DIM, MapName, ModelId, NewReference, Reference, ReferenceFields,
-    ReferenceId,
+    ContentHash, Descriptor, ExternalId, GLOBAL_DIM, MapName, ModelId, NewReference, Reference,
+    ReferenceFields, ReferenceId,
 };
 use rusqlite::{Connection, OptionalExtension, params};
 use time::OffsetDateTime;
@@ -29,13 +32,25 @@ pub(super) struct Prepared {
 impl Prepared {
     /// Checks and encodes.
     pub(super) fn new(new: NewReference) -> Result<Self, StoreError> {
-        let NewReference { map, fields, content_hash, model, descriptor } = new;
-        let Descriptor { global, pooled, patches } = descriptor;
+        let NewReference {
+            map,
+            fields,
+            content_hash,
+            model,
+            descriptor,
+        } = new;
+        let Descriptor {
+            global,
+            pooled,
+            patches,
+        } = descriptor;
         let invalid = |reason: String| StoreError::InvalidDescriptor { reason };
         check_global(&global)?;
         let pooled_bytes = codec::encode_f16(&pooled);
         if pooled.is_empty() || codec::decode_f16(&pooled_bytes).is_none() {
-            return Err(invalid("the pooled vector is empty or does not fit half precision".into()));
+            return Err(invalid(
+                "the pooled vector is empty or does not fit half precision".into(),
+            ));
         }
         Ok(Self {
             map,
@@ -58,7 +73,10 @@ impl Prepared {
 pub(super) fn check_global(global: &[f32]) -> Result<(), StoreError> {
     let invalid = |reason: String| Err(StoreError::InvalidDescriptor { reason });
     if global.len() != GLOBAL_DIM {
-        return invalid(format!("the global vector has {} values instead of {GLOBAL_DIM}", global.len()));
+        return invalid(format!(
+            "the global vector has {} values instead of {GLOBAL_DIM}",
+            global.len()
+        ));
     }
     if !global.iter().all(|v| v.is_finite()) {
         return invalid("the global vector holds a value that is not a finite number".into());
@@ -66,11 +84,19 @@ pub(super) fn check_global(global: &[f32]) -> Result<(), StoreError> {
     Ok(())
 }
 
-/// Stores `new` inside the writer's transaction; also returns the damaged reference it took the place of.
-pub(super) fn insert(connection: &Connection, new: &Prepared) -> Result<(Inserted, Option<Replaced>), StoreError> {
+/// Stores `new` inside the writer's transaction; also returns the damaged reference it took the
+/// place of.
+pub(super) fn insert(
+    connection: &Connection,
+    new: &Prepared,
+) -> Result<(Inserted, Option<Replaced>), StoreError> {
     let map = match MapRow::find(connection, &new.map)? {
         Some(map) if map.model != new.model => {
-            return Err(StoreError::ModelMismatch { map: new.map.clone(), bound: map.model, given: new.model.clone() });
+            return Err(StoreError::ModelMismatch {
+                map: new.map.clone(),
+                bound: map.model,
+                given: new.model.clone(),
+            });
         }
         Some(map) => map,
         None => create_map(connection, &new.map, &new.model)?,
@@ -90,18 +116,26 @@ pub(super) fn insert(connection: &Connection, new: &Prepared) -> Result<(Inserte
     crash_points::reach(crash_points::MID_INSERT);
     write_parts(connection, new, map.version, number).map_err(&writing)?;
     count(connection, map.number, 1).map_err(&writing)?;
-    let reference = row.reference(new.map.clone(), new.model.clone()).map_err(|error| match error {
-        RowError::Damaged(reason) => StoreError::InvalidDescriptor { reason },
-        RowError::Engine(error) => writing(error),
-    })?;
+    let reference =
+        row.reference(new.map.clone(), new.model.clone())
+            .map_err(|error| match error {
+                RowError::Damaged(reason) => StoreError::InvalidDescriptor { reason },
+                RowError::Engine(error) => writing(error),
+            })?;
     Ok((Inserted::Created(reference), healed))
 }
 
-fn create_map(connection: &Connection, name: &MapName, model: &ModelId) -> Result<MapRow, StoreError> {
+fn create_map(
+    connection: &Connection,
+    name: &MapName,
+    model: &ModelId,
+) -> Result<MapRow, StoreError> {
     let creating = failed("creating a map");
     let version = next_in_sequence(connection, "version").map_err(&creating)?;
     let number: i64 = connection
-        .query_row("SELECT coalesce(max(number), 0) + 1 FROM map", [], |row| row.get(0))
+        .query_row("SELECT coalesce(max(number), 0) + 1 FROM map", [], |row| {
+            row.get(0)
+        })
         .map_err(&creating)?;
     let map = MapRow {
         number,
@@ -117,7 +151,14 @@ fn create_map(connection: &Connection, name: &MapName, model: &ModelId) -> Resul
         .execute(
             "INSERT INTO map (number, name, model, version, reference_count, created_at, checksum)
              VALUES (?1, ?2, ?3, ?4, 0, ?5, ?6)",
-            params![number, name.as_str(), model.as_str(), version, to_micros(map.created_at), map.checksum()],
+            params![
+                number,
+                name.as_str(),
+                model.as_str(),
+                version,
+                to_micros(map.created_at),
+                map.checksum()
+            ],
         )
         .map_err(&creating)?;
     Ok(map)
@@ -131,7 +172,8 @@ enum Holder {
     Removed(Replaced),
 }
 
-/// A damaged reference that made way for its image sent again: its number, and its identity as far as it can be read.
+/// A damaged reference that made way for its image sent again: its number, and its identity as far
+/// as it can be read.
 pub(super) type Replaced = (i64, ReferenceId);
 
 /// Looks up the holder of an external id; an error if its content is another.
@@ -142,7 +184,8 @@ fn holder(
     content_hash: ContentHash,
 ) -> Result<Holder, StoreError> {
     let looking = failed("looking up an external id");
-    let Some(number) = number_of_external(connection, map.number, external_id).map_err(&looking)? else {
+    let Some(number) = number_of_external(connection, map.number, external_id).map_err(&looking)?
+    else {
         return Ok(Holder::Nobody);
     };
     let quarantined = connection
@@ -224,30 +267,56 @@ pub(super) fn write_row(connection: &Connection, row: &ReferenceRow) -> rusqlite
         .map(|_| ())
 }
 
-fn write_parts(connection: &Connection, new: &Prepared, version: i64, number: i64) -> rusqlite::Result<()> {
+fn write_parts(
+    connection: &Connection,
+    new: &Prepared,
+    version: i64,
+    number: i64,
+) -> rusqlite::Result<()> {
     write_global(connection, version, number, &new.global)?;
     connection
         .prepare_cached("INSERT INTO pooled_vector (number, vector, checksum) VALUES (?1, ?2, ?3)")?
-        .execute(params![number, new.pooled, pooled_checksum(number, &new.pooled)])?;
-    connection.prepare_cached("INSERT INTO patches (number, checksum, blob) VALUES (?1, ?2, ?3)")?.execute(params![
-        number,
-        patches_checksum(number, &new.patches),
-        new.patches
-    ])?;
+        .execute(params![
+            number,
+            new.pooled,
+            pooled_checksum(number, &new.pooled)
+        ])?;
+    connection
+        .prepare_cached("INSERT INTO patches (number, checksum, blob) VALUES (?1, ?2, ?3)")?
+        .execute(params![
+            number,
+            patches_checksum(number, &new.patches),
+            new.patches
+        ])?;
     Ok(())
 }
 
 /// Writes a global vector of some version.
-pub(super) fn write_global(connection: &Connection, version: i64, number: i64, vector: &[u8]) -> rusqlite::Result<()> {
+pub(super) fn write_global(
+    connection: &Connection,
+    version: i64,
+    number: i64,
+    vector: &[u8],
+) -> rusqlite::Result<()> {
     connection
-        .prepare_cached("INSERT INTO global_vector (version, number, vector, checksum) VALUES (?1, ?2, ?3, ?4)")?
-        .execute(params![version, number, vector, global_checksum(version, number, vector)])
+        .prepare_cached(
+            "INSERT INTO global_vector (version, number, vector, checksum) VALUES (?1, ?2, ?3, ?4)",
+        )?
+        .execute(params![
+            version,
+            number,
+            vector,
+            global_checksum(version, number, vector)
+        ])
         .map(|_| ())
 }
 
 /// Removes a reference with all its parts and keeps the map's count.
 pub(super) fn remove(connection: &Connection, map: &MapRow, number: i64) -> rusqlite::Result<()> {
-    for version in [Some(map.version), map.pending_version].into_iter().flatten() {
+    for version in [Some(map.version), map.pending_version]
+        .into_iter()
+        .flatten()
+    {
         connection
             .prepare_cached("DELETE FROM global_vector WHERE version = ?1 AND number = ?2")?
             .execute([version, number])?;

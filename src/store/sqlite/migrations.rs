@@ -1,7 +1,8 @@
 //! The schema's history, carried in the program and applied forward only.
 //!
-//! Each migration runs in a transaction of its own together with the row that records it, so that a crash leaves it
-//! applied or not, never half. A database that is ahead of this release, or whose past differs, is refused untouched.
+//! Each migration runs in a transaction of its own together with the row that records it, so that a
+//! crash leaves it applied or not, never half. A database that is ahead of this release, or whose
+//! past differs, is refused untouched.
 
 use super::engine::failed;
 use crate::store::{StoreError, crash_points};
@@ -9,8 +10,14 @@ use rusqlite::{Connection, TransactionBehavior, params};
 
 /// Every migration, oldest first; its version is its place, counting from 1.
 const MIGRATIONS: &[(&str, &str)] = &[
-    ("initial", include_str!("../../../migrations/sqlite/0001_initial.sql")),
-    ("map_head", include_str!("../../../migrations/sqlite/0002_map_head.sql")),
+    (
+        "initial",
+        include_str!("../../../migrations/sqlite/0001_initial.sql"),
+    ),
+    (
+        "map_head",
+        include_str!("../../../migrations/sqlite/0002_map_head.sql"),
+    ),
 ];
 
 const HISTORY: &str = "CREATE TABLE IF NOT EXISTS schema_migration (
@@ -42,7 +49,9 @@ fn apply_all(connection: &mut Connection, migrations: &[(&str, &str)]) -> Result
             None => {}
         }
         tracing::info!(version, name, "migrating the store");
-        let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate).map_err(&migrating)?;
+        let transaction = connection
+            .transaction_with_behavior(TransactionBehavior::Immediate)
+            .map_err(&migrating)?;
         transaction.execute_batch(HISTORY).map_err(&migrating)?;
         transaction.execute_batch(sql).map_err(&migrating)?;
         transaction
@@ -60,12 +69,18 @@ fn apply_all(connection: &mut Connection, migrations: &[(&str, &str)]) -> Result
 /// Versions and checksums applied so far, ascending; empty for a new database.
 fn history(connection: &Connection) -> Result<Vec<(i64, i64)>, StoreError> {
     let reading = failed("reading its schema history");
-    if !connection.table_exists(None, "schema_migration").map_err(&reading)? {
+    if !connection
+        .table_exists(None, "schema_migration")
+        .map_err(&reading)?
+    {
         return Ok(Vec::new());
     }
-    let mut statement =
-        connection.prepare("SELECT version, checksum FROM schema_migration ORDER BY version").map_err(&reading)?;
-    let rows = statement.query_map([], |row| Ok((row.get(0)?, row.get(1)?))).map_err(&reading)?;
+    let mut statement = connection
+        .prepare("SELECT version, checksum FROM schema_migration ORDER BY version")
+        .map_err(&reading)?;
+    let rows = statement
+        .query_map([], |row| Ok((row.get(0)?, row.get(1)?)))
+        .map_err(&reading)?;
     rows.collect::<Result<_, _>>().map_err(&reading)
 }
 
@@ -90,9 +105,18 @@ mod tests {
         let mut connection = Connection::open_in_memory().unwrap();
         apply_all(&mut connection, TWO).unwrap();
         let newer = apply_all(&mut connection, &TWO[..1]);
-        assert!(matches!(newer, Err(StoreError::SchemaTooNew { found: 2, supported: 1 })));
+        assert!(matches!(
+            newer,
+            Err(StoreError::SchemaTooNew {
+                found: 2,
+                supported: 1
+            })
+        ));
         let other = [TWO[0], ("b", "CREATE TABLE other (x)")];
-        assert!(matches!(apply_all(&mut connection, &other), Err(StoreError::MigrationChanged { version: 2 })));
+        assert!(matches!(
+            apply_all(&mut connection, &other),
+            Err(StoreError::MigrationChanged { version: 2 })
+        ));
     }
 
     #[test]

@@ -32,16 +32,19 @@ use self::quarantine::Quarantine;
 use self::rows::MapRow;
 use self::writer::{Effect, Pending, Writer};
 use super::{
-    Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined, ReferencePatch,
-    StoreConfig, StoreError, VerifyReport,
+    Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined,
+    ReferencePatch, StoreConfig, StoreError, VerifyReport,
 };
-use crate::types::{Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId};
+use crate::types::{
+    Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
+};
 use rusqlite::Connection;
 use std::path::{Path, PathBuf};
 
 /// A store in one directory, shared by all threads of one process.
 pub struct SqliteStore {
-    // Fields drop in this order: the writer finishes and closes the log while the directory is still locked.
+    // Fields drop in this order: the writer finishes and closes the log while the directory is
+    // still locked.
     writer: Writer,
     readers: Readers,
     quarantine: Quarantine,
@@ -53,8 +56,8 @@ pub struct SqliteStore {
 impl SqliteStore {
     /// Opens the store in `directory`, creating and migrating it as needed.
     ///
-    /// Fails with [`StoreError::Locked`] while another process has it, and with [`StoreError::SchemaTooNew`] if a
-    /// newer release wrote it.
+    /// Fails with [`StoreError::Locked`] while another process has it, and with
+    /// [`StoreError::SchemaTooNew`] if a newer release wrote it.
     pub fn open(directory: &Path, config: &StoreConfig) -> Result<Self, StoreError> {
         let claimed = DataDirectory::claim(directory)?;
         let reserve = Reserve::take(directory, config)?;
@@ -69,15 +72,26 @@ impl SqliteStore {
         let quarantine = Quarantine::load(&connection)?;
         let writer = Writer::start(connection, reserve, config.queue)?;
         let readers = Readers::new(path.clone(), config.clone());
-        Ok(Self { writer, readers, quarantine, path, config: config.clone(), _directory: claimed })
+        Ok(Self {
+            writer,
+            readers,
+            quarantine,
+            path,
+            config: config.clone(),
+            _directory: claimed,
+        })
     }
 
     /// Name of the database inside a data directory.
     pub const DATABASE: &str = directory::DATABASE;
 
-    /// As [`PlaceStore::backup`], of the store in a directory that another process may have open: only its database is
-    /// read. `target` must not exist.
-    pub fn backup_of(directory: &Path, config: &StoreConfig, target: &Path) -> Result<u64, StoreError> {
+    /// As [`PlaceStore::backup`], of the store in a directory that another process may have open:
+    /// only its database is read. `target` must not exist.
+    pub fn backup_of(
+        directory: &Path,
+        config: &StoreConfig,
+        target: &Path,
+    ) -> Result<u64, StoreError> {
         let path = directory.join(directory::DATABASE);
         backup::write(&engine::open_reader(&path, config)?, target)
     }
@@ -89,15 +103,20 @@ impl SqliteStore {
         }
         tracing::error!(reference = %id, reason, "a stored reference is damaged; it is quarantined");
         let owned = reason.to_owned();
-        let record = move |connection: &Connection| change::quarantine(connection, number, map, id, &owned);
+        let record =
+            move |connection: &Connection| change::quarantine(connection, number, map, id, &owned);
         if let Err(error) = self.writer.run(Effect::Shrinks, record) {
             // It stays out of service while this process lives and will be found again by the next.
             tracing::warn!(%error, reference = %id, "cannot record the quarantine");
         }
     }
 
-    /// Reads with a connection from the pool; damage that no single record answers for is counted here.
-    fn reading<T>(&self, work: impl FnOnce(&Connection) -> Result<T, StoreError>) -> Result<T, StoreError> {
+    /// Reads with a connection from the pool; damage that no single record answers for is counted
+    /// here.
+    fn reading<T>(
+        &self,
+        work: impl FnOnce(&Connection) -> Result<T, StoreError>,
+    ) -> Result<T, StoreError> {
         self.noticing(self.readers.with(work))
     }
 
@@ -112,28 +131,48 @@ impl SqliteStore {
 
     fn noticing<T>(&self, outcome: Result<T, StoreError>) -> Result<T, StoreError> {
         outcome.inspect_err(|error| match error {
-            StoreError::Damaged { .. } | StoreError::CorruptMap { .. } | StoreError::CorruptHead { .. } => {
+            StoreError::Damaged { .. }
+            | StoreError::CorruptMap { .. }
+            | StoreError::CorruptHead { .. } => {
                 self.quarantine.met(error.to_string(), None);
             }
             _ => {}
         })
     }
 
-    fn submit_insert(&self, new: NewReference) -> Result<Pending<(Inserted, Option<Replaced>)>, StoreError> {
+    fn submit_insert(
+        &self,
+        new: NewReference,
+    ) -> Result<Pending<(Inserted, Option<Replaced>)>, StoreError> {
         let prepared = Prepared::new(new)?;
-        self.writer.submit(Effect::Grows(prepared.bytes()), move |connection| insert::insert(connection, &prepared))
+        self.writer
+            .submit(Effect::Grows(prepared.bytes()), move |connection| {
+                insert::insert(connection, &prepared)
+            })
     }
 
-    fn finish_insert(&self, pending: Pending<(Inserted, Option<Replaced>)>) -> Result<Inserted, StoreError> {
+    fn finish_insert(
+        &self,
+        pending: Pending<(Inserted, Option<Replaced>)>,
+    ) -> Result<Inserted, StoreError> {
         let (inserted, healed) = self.noticing(pending.wait())?;
-        healed.into_iter().for_each(|(number, id)| self.quarantine.replaced(number, id));
+        healed
+            .into_iter()
+            .for_each(|(number, id)| self.quarantine.replaced(number, id));
         Ok(inserted)
     }
 
     fn info(&self, map: MapRow) -> MapInfo {
-        let references = (map.reference_count.max(0) as u64).saturating_sub(self.quarantine.count(map.number));
+        let references =
+            (map.reference_count.max(0) as u64).saturating_sub(self.quarantine.count(map.number));
         let calibration = map.calibration();
-        MapInfo { name: map.name, model: map.model, references, created_at: map.created_at, calibration }
+        MapInfo {
+            name: map.name,
+            model: map.model,
+            references,
+            created_at: map.created_at,
+            calibration,
+        }
     }
 }
 
@@ -145,29 +184,45 @@ impl PlaceStore for SqliteStore {
 
     fn insert_many(&self, new: Vec<NewReference>) -> Vec<Result<Inserted, StoreError>> {
         let pending: Vec<_> = new.into_iter().map(|new| self.submit_insert(new)).collect();
-        pending.into_iter().map(|pending| self.finish_insert(pending?)).collect()
+        pending
+            .into_iter()
+            .map(|pending| self.finish_insert(pending?))
+            .collect()
     }
 
     fn get(&self, id: ReferenceId) -> Result<Reference, StoreError> {
         self.reading(|connection| self.read_reference(connection, id))
     }
 
-    fn find_external(&self, map: &MapName, external_id: &ExternalId) -> Result<Option<Reference>, StoreError> {
+    fn find_external(
+        &self,
+        map: &MapName,
+        external_id: &ExternalId,
+    ) -> Result<Option<Reference>, StoreError> {
         self.reading(|connection| self.read_external(connection, map, external_id))
     }
 
     fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, StoreError> {
         self.get(id)?;
-        self.writing(Effect::Grows(1024), move |connection| change::update(connection, id, patch.clone()))
+        self.writing(Effect::Grows(1024), move |connection| {
+            change::update(connection, id, patch.clone())
+        })
     }
 
     fn delete(&self, id: ReferenceId) -> Result<Reference, StoreError> {
-        let (number, reference) = self.writing(Effect::Shrinks, move |connection| change::delete(connection, id))?;
+        let (number, reference) = self.writing(Effect::Shrinks, move |connection| {
+            change::delete(connection, id)
+        })?;
         self.quarantine.forget(number);
         Ok(reference)
     }
 
-    fn list(&self, map: Option<&MapName>, after: Option<ReferenceId>, limit: usize) -> Result<Page, StoreError> {
+    fn list(
+        &self,
+        map: Option<&MapName>,
+        after: Option<ReferenceId>,
+        limit: usize,
+    ) -> Result<Page, StoreError> {
         self.reading(|connection| self.read_page(connection, map, after, limit))
     }
 
@@ -182,13 +237,15 @@ impl PlaceStore for SqliteStore {
     }
 
     fn map(&self, name: &MapName) -> Result<MapInfo, StoreError> {
-        self.reading(|connection| MapRow::require(connection, name)).map(|map| self.info(map))
+        self.reading(|connection| MapRow::require(connection, name))
+            .map(|map| self.info(map))
     }
 
     fn delete_map(&self, name: &MapName) -> Result<u64, StoreError> {
         let name = name.clone();
-        let (number, references) =
-            self.writing(Effect::Shrinks, move |connection| change::delete_map(connection, &name))?;
+        let (number, references) = self.writing(Effect::Shrinks, move |connection| {
+            change::delete_map(connection, &name)
+        })?;
         super::crash_points::reach(super::crash_points::MAP_DELETED);
         let damaged = self.quarantine.count(number);
         self.quarantine.forget_map(number);
@@ -213,7 +270,11 @@ impl PlaceStore for SqliteStore {
         self.reading(|connection| self.read_patches(connection, id))
     }
 
-    fn scan_globals(&self, map: &MapName, visit: &mut dyn FnMut(GlobalRow)) -> Result<(), StoreError> {
+    fn scan_globals(
+        &self,
+        map: &MapName,
+        visit: &mut dyn FnMut(GlobalRow),
+    ) -> Result<(), StoreError> {
         self.reading(|connection| {
             // One snapshot: a head exchanged meanwhile must not pull the version away.
             let scanning = engine::failed("reading global vectors");
@@ -223,7 +284,12 @@ impl PlaceStore for SqliteStore {
         })
     }
 
-    fn replace_globals(&self, map: &MapName, head: NewHead, exchange: &mut dyn HeadExchange) -> Result<(), StoreError> {
+    fn replace_globals(
+        &self,
+        map: &MapName,
+        head: NewHead,
+        exchange: &mut dyn HeadExchange,
+    ) -> Result<(), StoreError> {
         self.exchange_head(map, head, exchange)
     }
 
@@ -231,7 +297,11 @@ impl PlaceStore for SqliteStore {
         self.reading(|connection| rehead::read_head(connection, &MapRow::require(connection, map)?))
     }
 
-    fn set_calibration(&self, map: &MapName, calibration: Option<Calibration>) -> Result<(), StoreError> {
+    fn set_calibration(
+        &self,
+        map: &MapName,
+        calibration: Option<Calibration>,
+    ) -> Result<(), StoreError> {
         let map = map.clone();
         self.writing(Effect::Grows(2048), move |connection| {
             change::set_calibration(connection, &map, calibration.as_ref())
@@ -262,6 +332,9 @@ impl PlaceStore for SqliteStore {
         };
         let on_disk = size("") + size("-wal") + size("-shm");
         let connections = self.readers.open() as u64 + 1;
-        Ok((on_disk, connections * u64::from(self.config.cache_kib) * 1024))
+        Ok((
+            on_disk,
+            connections * u64::from(self.config.cache_kib) * 1024,
+        ))
     }
 }

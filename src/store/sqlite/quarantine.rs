@@ -1,8 +1,9 @@
-//! References known to be damaged, mirrored in memory so that no read path asks the disk about them.
+//! References known to be damaged, mirrored in memory so that no read path asks the disk about
+//! them.
 //!
-//! The mirror is the authority while the process lives: it holds even when the disk is too full to record the find.
-//! Beside it stands what was met since the store's user last asked, so that damage is counted, and leaves the user's
-//! index, whichever call met it.
+//! The mirror is the authority while the process lives: it holds even when the disk is too full to
+//! record the find. Beside it stands what was met since the store's user last asked, so that damage
+//! is counted, and leaves the user's index, whichever call met it.
 
 use super::engine::failed;
 use crate::store::{Damage, Quarantined, StoreError};
@@ -11,7 +12,8 @@ use rusqlite::Connection;
 use std::collections::{BTreeMap, HashSet};
 use std::sync::{Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
-/// Damage without a number that is remembered. A damaged page of the index may be asked for any number of identities.
+/// Damage without a number that is remembered. A damaged page of the index may be asked for any
+/// number of identities.
 const REMEMBERED: usize = 10_000;
 
 #[derive(Debug, Clone)]
@@ -39,18 +41,34 @@ impl Quarantine {
     /// Reads what earlier processes recorded.
     pub(super) fn load(connection: &Connection) -> Result<Self, StoreError> {
         let loading = failed("reading the quarantine");
-        let mut statement = connection.prepare("SELECT number, id, map, reason FROM quarantine").map_err(&loading)?;
+        let mut statement = connection
+            .prepare("SELECT number, id, map, reason FROM quarantine")
+            .map_err(&loading)?;
         let rows = statement.query_map([], |row| {
-            let entry = Entry { id: ReferenceId::from_bytes(row.get(1)?), map: row.get(2)?, reason: row.get(3)? };
+            let entry = Entry {
+                id: ReferenceId::from_bytes(row.get(1)?),
+                map: row.get(2)?,
+                reason: row.get(3)?,
+            };
             Ok((row.get(0)?, entry))
         });
-        let entries = rows.map_err(&loading)?.collect::<Result<_, _>>().map_err(&loading)?;
-        Ok(Self { entries: RwLock::new(entries), news: Mutex::default() })
+        let entries = rows
+            .map_err(&loading)?
+            .collect::<Result<_, _>>()
+            .map_err(&loading)?;
+        Ok(Self {
+            entries: RwLock::new(entries),
+            news: Mutex::default(),
+        })
     }
 
     /// Adds a reference; false if it was known.
     pub(super) fn add(&self, number: i64, map: i64, id: ReferenceId, reason: &str) -> bool {
-        let entry = Entry { map, id, reason: reason.to_owned() };
+        let entry = Entry {
+            map,
+            id,
+            reason: reason.to_owned(),
+        };
         let mut entries = self.write();
         if entries.contains_key(&number) {
             return false;
@@ -64,8 +82,8 @@ impl Quarantine {
         true
     }
 
-    /// Damage was met that no quarantined reference stands for, such as one that cannot even be located; the first time
-    /// it is news.
+    /// Damage was met that no quarantined reference stands for, such as one that cannot even be
+    /// located; the first time it is news.
     pub(super) fn met(&self, what: String, reference: Option<ReferenceId>) {
         self.tell(|news| {
             if news.counted.len() < REMEMBERED && news.counted.insert(what) {
@@ -75,13 +93,15 @@ impl Quarantine {
         });
     }
 
-    /// A damaged reference's image was sent again and took its place. `id` is what its row said, in case the damage is
-    /// news.
+    /// A damaged reference's image was sent again and took its place. `id` is what its row said, in
+    /// case the damage is news.
     pub(super) fn replaced(&self, number: i64, id: ReferenceId) {
         let known = self.write().remove(&number);
         self.tell(|news| {
             news.damage.found += u64::from(known.is_none());
-            news.damage.withdrawn.extend([id].into_iter().chain(known.map(|entry| entry.id)));
+            news.damage
+                .withdrawn
+                .extend([id].into_iter().chain(known.map(|entry| entry.id)));
         });
     }
 
@@ -107,7 +127,10 @@ impl Quarantine {
 
     /// How many references of a map are quarantined.
     pub(super) fn count(&self, map: i64) -> u64 {
-        self.read().values().filter(|entry| entry.map == map).count() as u64
+        self.read()
+            .values()
+            .filter(|entry| entry.map == map)
+            .count() as u64
     }
 
     /// Forgets a deleted reference.
@@ -122,7 +145,13 @@ impl Quarantine {
 
     /// All of them.
     pub(super) fn list(&self) -> Vec<Quarantined> {
-        self.read().values().map(|entry| Quarantined { id: entry.id, reason: entry.reason.clone() }).collect()
+        self.read()
+            .values()
+            .map(|entry| Quarantined {
+                id: entry.id,
+                reason: entry.reason.clone(),
+            })
+            .collect()
     }
 
     fn read(&self) -> RwLockReadGuard<'_, BTreeMap<i64, Entry>> {

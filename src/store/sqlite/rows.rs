@@ -1,13 +1,15 @@
 //! Rows of the database <-> the types of the crate, and the checksum that every row carries.
 //!
-//! A checksum covers each column with a tag for its presence and its length, so that no two different rows share
-//! their bytes, and it covers the row's number, so that a row cannot pass for another. Reading verifies it; a row
-//! that fails is [`RowError::Damaged`] and the caller has it quarantined.
+//! A checksum covers each column with a tag for its presence and its length, so that no two
+//! different rows share their bytes, and it covers the row's number, so that a row cannot pass for
+//! another. Reading verifies it; a row that fails is [`RowError::Damaged`] and the caller has it
+//! quarantined.
 
 use super::engine::{damage, failed};
 use crate::store::{StoreError, codec};
 use crate::types::{
-    Calibration, ContentHash, GeoPoint, Heading, MapName, ModelId, Reference, ReferenceFields, ReferenceId,
+    Calibration, ContentHash, GeoPoint, Heading, MapName, ModelId, Reference, ReferenceFields,
+    ReferenceId,
 };
 use rusqlite::{Connection, OptionalExtension, Row, params};
 use time::{OffsetDateTime, UtcOffset};
@@ -92,8 +94,7 @@ pub(super) struct MapRow {
     pub created_at: OffsetDateTime,
 }
 
-const MAP_COLUMNS: &str =
-    "number, name, model, version, pending_version, reference_count, calibration, created_at, checksum";
+const MAP_COLUMNS: &str = "number, name, model, version, pending_version, reference_count, calibration, created_at, checksum";
 
 impl MapRow {
     pub(super) fn checksum(&self) -> i64 {
@@ -111,7 +112,9 @@ impl MapRow {
         let name: String = row.get(1)?;
         let map = Self {
             number: row.get(0)?,
-            name: name.parse().map_err(|error| RowError::Damaged(format!("{error}")))?,
+            name: name
+                .parse()
+                .map_err(|error| RowError::Damaged(format!("{error}")))?,
             model: ModelId::new(row.get::<_, String>(2)?),
             version: row.get(3)?,
             pending_version: row.get(4)?,
@@ -124,15 +127,22 @@ impl MapRow {
     }
 
     /// The map of this name, if there is one.
-    pub(super) fn find(connection: &Connection, name: &MapName) -> Result<Option<Self>, StoreError> {
+    pub(super) fn find(
+        connection: &Connection,
+        name: &MapName,
+    ) -> Result<Option<Self>, StoreError> {
         let reading = failed("reading a map");
         let sql = format!("SELECT {MAP_COLUMNS} FROM map WHERE name = ?1");
         let mut statement = connection.prepare_cached(&sql).map_err(&reading)?;
         let mut rows = statement.query([name.as_str()]).map_err(&reading)?;
-        let Some(row) = rows.next().map_err(&reading)? else { return Ok(None) };
+        let Some(row) = rows.next().map_err(&reading)? else {
+            return Ok(None);
+        };
         match Self::read(row) {
             Ok(map) => Ok(Some(map)),
-            Err(RowError::Damaged(_)) => Err(StoreError::CorruptMap { map: name.to_string() }),
+            Err(RowError::Damaged(_)) => Err(StoreError::CorruptMap {
+                map: name.to_string(),
+            }),
             Err(RowError::Engine(error)) => Err(reading(error)),
         }
     }
@@ -152,15 +162,18 @@ impl MapRow {
         while let Some(row) = rows.next().map_err(&reading)? {
             match Self::read(row) {
                 Ok(map) => maps.push(map),
-                Err(RowError::Damaged(_)) => damaged.push(row.get::<_, String>(1).unwrap_or_else(|_| "?".into())),
+                Err(RowError::Damaged(_)) => {
+                    damaged.push(row.get::<_, String>(1).unwrap_or_else(|_| "?".into()))
+                }
                 Err(RowError::Engine(error)) => return Err(reading(error)),
             }
         }
         Ok((maps, damaged))
     }
 
-    /// The map's calibration, if it has one that this release can read. Its bytes are as they were written (the row's
-    /// checksum says so), so one that cannot be read comes from another release: the map goes on without it.
+    /// The map's calibration, if it has one that this release can read. Its bytes are as they were
+    /// written (the row's checksum says so), so one that cannot be read comes from another release:
+    /// the map goes on without it.
     pub(super) fn calibration(&self) -> Option<Calibration> {
         let text = self.calibration.as_deref()?;
         serde_json::from_str(text)
@@ -193,7 +206,9 @@ fn verify(stored: i64, found: i64) -> Result<(), RowError> {
     if stored == found {
         Ok(())
     } else {
-        Err(RowError::Damaged(format!("row checksum {found:08x} where {stored:08x} was stored")))
+        Err(RowError::Damaged(format!(
+            "row checksum {found:08x} where {stored:08x} was stored"
+        )))
     }
 }
 
@@ -202,7 +217,8 @@ pub(super) const REFERENCE_COLUMNS: &str = "r.number, r.id, r.map, r.external_id
      r.captured_at, r.metadata, r.content_hash, r.created_at, r.checksum, m.name, m.model";
 
 /// References of maps that are not deleted.
-pub(super) const REFERENCE_SOURCE: &str = "reference r JOIN map m ON m.number = r.map AND m.name IS NOT NULL";
+pub(super) const REFERENCE_SOURCE: &str =
+    "reference r JOIN map m ON m.number = r.map AND m.name IS NOT NULL";
 
 /// A reference's row, column by column.
 #[derive(Debug, Clone)]
@@ -228,7 +244,10 @@ impl ReferenceRow {
         self.lon = fields.location.map(GeoPoint::lon);
         self.heading = fields.heading.map(Heading::degrees);
         self.captured_at = fields.captured_at.map(to_micros);
-        self.metadata = fields.metadata.as_ref().map(|object| serde_json::Value::from(object.clone()).to_string());
+        self.metadata = fields
+            .metadata
+            .as_ref()
+            .map(|object| serde_json::Value::from(object.clone()).to_string());
     }
 
     pub(super) fn checksum(&self) -> i64 {
@@ -271,9 +290,13 @@ impl ReferenceRow {
     }
 
     /// Location and capture time, which the search index filters by.
-    pub(super) fn place_and_time(&self) -> Result<(Option<GeoPoint>, Option<OffsetDateTime>), RowError> {
+    pub(super) fn place_and_time(
+        &self,
+    ) -> Result<(Option<GeoPoint>, Option<OffsetDateTime>), RowError> {
         let location = match (self.lat, self.lon) {
-            (Some(lat), Some(lon)) => Some(GeoPoint::new(lat, lon).map_err(|e| RowError::Damaged(e.to_string()))?),
+            (Some(lat), Some(lon)) => {
+                Some(GeoPoint::new(lat, lon).map_err(|e| RowError::Damaged(e.to_string()))?)
+            }
             _ => None,
         };
         Ok((location, self.captured_at.map(from_micros).transpose()?))
@@ -288,9 +311,17 @@ impl ReferenceRow {
             id,
             map,
             fields: ReferenceFields {
-                external_id: self.external_id.map(|id| id.parse()).transpose().map_err(|e| wrong(format!("{e}")))?,
+                external_id: self
+                    .external_id
+                    .map(|id| id.parse())
+                    .transpose()
+                    .map_err(|e| wrong(format!("{e}")))?,
                 location,
-                heading: self.heading.map(Heading::new).transpose().map_err(|e| wrong(e.to_string()))?,
+                heading: self
+                    .heading
+                    .map(Heading::new)
+                    .transpose()
+                    .map_err(|e| wrong(e.to_string()))?,
                 captured_at,
                 metadata: self
                     .metadata
@@ -309,19 +340,25 @@ impl ReferenceRow {
 pub(super) fn read_reference(row: &Row<'_>) -> Result<Reference, RowError> {
     let columns = ReferenceRow::read(row)?;
     let name: String = row.get(12)?;
-    let map = name.parse().map_err(|error| RowError::Damaged(format!("{error}")))?;
+    let map = name
+        .parse()
+        .map_err(|error| RowError::Damaged(format!("{error}")))?;
     columns.reference(map, ModelId::new(row.get::<_, String>(13)?))
 }
 
-/// A reference's number and its map's, from the index alone, whatever the state of its row. Where that cannot be read,
-/// it is this reference that is damaged: others may lie on sound pages.
+/// A reference's number and its map's, from the index alone, whatever the state of its row. Where
+/// that cannot be read, it is this reference that is damaged: others may lie on sound pages.
 pub(super) fn locate(connection: &Connection, id: ReferenceId) -> Result<(i64, i64), StoreError> {
     let sql = "SELECT r.number, r.map FROM reference r JOIN map m ON m.number = r.map AND m.name IS NOT NULL
                WHERE r.id = ?1";
     connection
         .prepare_cached(sql)
         .and_then(|mut statement| {
-            statement.query_row([id.as_bytes().as_slice()], |row| Ok((row.get(0)?, row.get(1)?))).optional()
+            statement
+                .query_row([id.as_bytes().as_slice()], |row| {
+                    Ok((row.get(0)?, row.get(1)?))
+                })
+                .optional()
         })
         .map_err(|error| match damage(&error) {
             Some(reason) => StoreError::Corrupt { id, reason },
@@ -338,7 +375,10 @@ pub(super) fn id_of(connection: &Connection, number: i64) -> ReferenceId {
 }
 
 /// The reference of this number.
-pub(super) fn reference_by_number(connection: &Connection, number: i64) -> Result<Option<Reference>, RowError> {
+pub(super) fn reference_by_number(
+    connection: &Connection,
+    number: i64,
+) -> Result<Option<Reference>, RowError> {
     let sql = format!("SELECT {REFERENCE_COLUMNS} FROM {REFERENCE_SOURCE} WHERE r.number = ?1");
     let mut statement = connection.prepare_cached(&sql)?;
     let mut rows = statement.query([number])?;
@@ -347,39 +387,65 @@ pub(super) fn reference_by_number(connection: &Connection, number: i64) -> Resul
 
 /// Checksum of a global vector's row.
 pub(super) fn global_checksum(version: i64, number: i64, vector: &[u8]) -> i64 {
-    Checksum::of("global_vector").integer(version).integer(number).bytes(vector).finish()
+    Checksum::of("global_vector")
+        .integer(version)
+        .integer(number)
+        .bytes(vector)
+        .finish()
 }
 
 /// Verifies and reads a global vector.
-pub(super) fn read_global(version: i64, number: i64, vector: &[u8], checksum: i64) -> Result<Vec<f32>, RowError> {
+pub(super) fn read_global(
+    version: i64,
+    number: i64,
+    vector: &[u8],
+    checksum: i64,
+) -> Result<Vec<f32>, RowError> {
     verify(checksum, global_checksum(version, number, vector))?;
-    codec::decode_f32(vector).ok_or_else(|| RowError::Damaged("the global vector holds no numbers".into()))
+    codec::decode_f32(vector)
+        .ok_or_else(|| RowError::Damaged("the global vector holds no numbers".into()))
 }
 
 /// Checksum of a head that the map of `model` keeps.
 pub(super) fn head_checksum(version: i64, model: &ModelId, file: &[u8]) -> i64 {
-    Checksum::of("map_head").integer(version).bytes(model.as_str().as_bytes()).bytes(file).finish()
+    Checksum::of("map_head")
+        .integer(version)
+        .bytes(model.as_str().as_bytes())
+        .bytes(file)
+        .finish()
 }
 
 /// Checksum of a pooled vector's row.
 pub(super) fn pooled_checksum(number: i64, vector: &[u8]) -> i64 {
-    Checksum::of("pooled_vector").integer(number).bytes(vector).finish()
+    Checksum::of("pooled_vector")
+        .integer(number)
+        .bytes(vector)
+        .finish()
 }
 
 /// Verifies and reads a pooled vector.
 pub(super) fn read_pooled(number: i64, vector: &[u8], checksum: i64) -> Result<Vec<f32>, RowError> {
     verify(checksum, pooled_checksum(number, vector))?;
-    codec::decode_f16(vector).ok_or_else(|| RowError::Damaged("the pooled vector holds no numbers".into()))
+    codec::decode_f16(vector)
+        .ok_or_else(|| RowError::Damaged("the pooled vector holds no numbers".into()))
 }
 
-/// Checksum of a patches row. The blob verifies itself; this binds its own checksum to the row's number.
+/// Checksum of a patches row. The blob verifies itself; this binds its own checksum to the row's
+/// number.
 pub(super) fn patches_checksum(number: i64, blob: &[u8]) -> i64 {
     let sealed = codec::trailing_checksum(blob).unwrap_or_default();
-    Checksum::of("patches").integer(number).integer(i64::from(sealed)).finish()
+    Checksum::of("patches")
+        .integer(number)
+        .integer(i64::from(sealed))
+        .finish()
 }
 
 /// Verifies and reads key patches.
-pub(super) fn read_patches(number: i64, blob: &[u8], checksum: i64) -> Result<crate::types::PackedPatches, RowError> {
+pub(super) fn read_patches(
+    number: i64,
+    blob: &[u8],
+    checksum: i64,
+) -> Result<crate::types::PackedPatches, RowError> {
     verify(checksum, patches_checksum(number, blob))?;
     codec::decode(blob).map_err(|error| RowError::Damaged(format!("key patches: {error}")))
 }

@@ -1,12 +1,13 @@
 //! The one thread that writes, and how many writers share one sync of the disk.
 //!
-//! Callers hand in jobs and wait. The thread takes the first job and whatever else waits by then, runs all in one
-//! transaction, each under a savepoint of its own, commits once, and only then tells every caller. While the disk
-//! syncs, the next group gathers by itself; an idle store commits a lone job at once. A job that fails undoes itself
-//! only. If the group as a whole fails, each job is tried again alone, so that nobody pays for another's fault.
+//! Callers hand in jobs and wait. The thread takes the first job and whatever else waits by then,
+//! runs all in one transaction, each under a savepoint of its own, commits once, and only then
+//! tells every caller. While the disk syncs, the next group gathers by itself; an idle store
+//! commits a lone job at once. A job that fails undoes itself only. If the group as a whole fails,
+//! each job is tried again alone, so that nobody pays for another's fault.
 //!
-//! On a full disk the log is folded into the database and the job tried once more; deletes may then use up the
-//! [`Reserve`], and until it can be restored jobs that grow the store are refused.
+//! On a full disk the log is folded into the database and the job tried once more; deletes may then
+//! use up the [`Reserve`], and until it can be restored jobs that grow the store are refused.
 
 use super::directory::Reserve;
 use super::engine::failed;
@@ -59,11 +60,16 @@ impl<T: Send, F: FnMut(&Connection) -> Result<T, StoreError> + Send> Job for Tas
     }
 
     fn error(&self) -> Option<&StoreError> {
-        self.outcome.as_ref().and_then(|outcome| outcome.as_ref().err())
+        self.outcome
+            .as_ref()
+            .and_then(|outcome| outcome.as_ref().err())
     }
 
     fn finish(self: Box<Self>, failure: Option<StoreError>) {
-        let outcome = failure.map(Err).or(self.outcome).unwrap_or(Err(StoreError::Closing));
+        let outcome = failure
+            .map(Err)
+            .or(self.outcome)
+            .unwrap_or(Err(StoreError::Closing));
         // A caller that stopped waiting has nothing to hear.
         let _ = self.reply.send(outcome);
     }
@@ -79,7 +85,8 @@ impl<T> Pending<T> {
     }
 }
 
-/// The handle to the writing thread; dropping it finishes the jobs at hand, then closes the database.
+/// The handle to the writing thread; dropping it finishes the jobs at hand, then closes the
+/// database.
 pub(super) struct Writer {
     jobs: Option<SyncSender<Box<dyn Job>>>,
     thread: Option<JoinHandle<()>>,
@@ -87,26 +94,46 @@ pub(super) struct Writer {
 
 impl Writer {
     /// Starts the thread on `connection`. At most `queue` jobs wait; further callers block.
-    pub(super) fn start(connection: Connection, reserve: Reserve, queue: usize) -> Result<Self, StoreError> {
+    pub(super) fn start(
+        connection: Connection,
+        reserve: Reserve,
+        queue: usize,
+    ) -> Result<Self, StoreError> {
         let (jobs, waiting) = sync_channel(queue.max(1));
         let purging = purge::is_pending(&connection)?;
-        let worker = Worker { connection, reserve, waiting, purging };
+        let worker = Worker {
+            connection,
+            reserve,
+            waiting,
+            purging,
+        };
         let thread = std::thread::Builder::new()
             .name("store-writer".into())
             .spawn(move || worker.run())
-            .map_err(|source| StoreError::Engine { context: "starting its writer thread", source: Box::new(source) })?;
-        Ok(Self { jobs: Some(jobs), thread: Some(thread) })
+            .map_err(|source| StoreError::Engine {
+                context: "starting its writer thread",
+                source: Box::new(source),
+            })?;
+        Ok(Self {
+            jobs: Some(jobs),
+            thread: Some(thread),
+        })
     }
 
-    /// Hands in a job without waiting for its outcome. It may run more than once, so it must not keep state between
-    /// runs.
+    /// Hands in a job without waiting for its outcome. It may run more than once, so it must not
+    /// keep state between runs.
     pub(super) fn submit<T: Send + 'static>(
         &self,
         effect: Effect,
         work: impl FnMut(&Connection) -> Result<T, StoreError> + Send + 'static,
     ) -> Result<Pending<T>, StoreError> {
         let (reply, answer) = sync_channel(1);
-        let task = Task { effect, work, outcome: None, reply };
+        let task = Task {
+            effect,
+            work,
+            outcome: None,
+            reply,
+        };
         let jobs = self.jobs.as_ref().ok_or(StoreError::Closing)?;
         jobs.send(Box::new(task)).map_err(|_| StoreError::Closing)?;
         Ok(Pending(answer))
@@ -187,15 +214,21 @@ impl Worker {
     fn commit(&mut self, group: Vec<Box<dyn Job>>) {
         let (mut admitted, mut refused) = (group, Vec::new());
         if !self.reserve.held() && !self.restore_reserve() {
-            (admitted, refused) = admitted.into_iter().partition(|job| job.effect() == Effect::Shrinks);
+            (admitted, refused) = admitted
+                .into_iter()
+                .partition(|job| job.effect() == Effect::Shrinks);
         }
-        refused.into_iter().for_each(|job| job.finish(Some(StoreError::DiskFull)));
+        refused
+            .into_iter()
+            .for_each(|job| job.finish(Some(StoreError::DiskFull)));
         if admitted.is_empty() {
             return;
         }
         match self.attempt(&mut admitted) {
             Ok(()) => admitted.into_iter().for_each(|job| job.finish(None)),
-            Err(_) if admitted.len() > 1 => admitted.into_iter().for_each(|job| self.commit_alone(job)),
+            Err(_) if admitted.len() > 1 => {
+                admitted.into_iter().for_each(|job| self.commit_alone(job))
+            }
             Err(error) => admitted.into_iter().for_each(|job| self.retry(job, &error)),
         }
     }
@@ -223,7 +256,9 @@ impl Worker {
     fn attempt(&self, jobs: &mut [Box<dyn Job>]) -> Result<(), StoreError> {
         crash_points::reach(crash_points::BEFORE_BEGIN);
         let writing = failed("writing");
-        self.connection.execute_batch("BEGIN IMMEDIATE").map_err(&writing)?;
+        self.connection
+            .execute_batch("BEGIN IMMEDIATE")
+            .map_err(&writing)?;
         let outcome = self.run_all(jobs).and_then(|()| {
             crash_points::reach(crash_points::BEFORE_COMMIT);
             self.connection.execute_batch("COMMIT").map_err(&writing)
@@ -241,14 +276,25 @@ impl Worker {
     fn run_all(&self, jobs: &mut [Box<dyn Job>]) -> Result<(), StoreError> {
         let writing = failed("writing");
         for job in jobs {
-            self.connection.execute_batch("SAVEPOINT job").map_err(&writing)?;
+            self.connection
+                .execute_batch("SAVEPOINT job")
+                .map_err(&writing)?;
             job.run(&self.connection);
             match job.error() {
-                None => self.connection.execute_batch("RELEASE job").map_err(&writing)?,
-                // The engine may have rolled everything back itself; the others must then start over.
+                None => self
+                    .connection
+                    .execute_batch("RELEASE job")
+                    .map_err(&writing)?,
+                // The engine may have rolled everything back itself; the others must then start
+                // over.
                 Some(StoreError::DiskFull) => return Err(StoreError::DiskFull),
-                Some(_) if self.connection.is_autocommit() => return Err(StoreError::Busy { context: "writing" }),
-                Some(_) => self.connection.execute_batch("ROLLBACK TO job; RELEASE job").map_err(&writing)?,
+                Some(_) if self.connection.is_autocommit() => {
+                    return Err(StoreError::Busy { context: "writing" });
+                }
+                Some(_) => self
+                    .connection
+                    .execute_batch("ROLLBACK TO job; RELEASE job")
+                    .map_err(&writing)?,
             }
         }
         Ok(())
@@ -290,7 +336,10 @@ impl Worker {
 
     /// Folds the log into the database as far as readers allow, and cuts it.
     fn checkpoint(&self) {
-        if let Err(error) = self.connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |_| Ok(())) {
+        if let Err(error) = self
+            .connection
+            .query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |_| Ok(()))
+        {
             tracing::warn!(%error, "cannot fold the log into the database now");
         }
     }

@@ -32,27 +32,54 @@ fn matrix(rows: &[Vec<f32>]) -> Tensor {
 
 fn assert_near(what: &str, actual: &Tensor, expected: &[f32], tolerance: f32) {
     let actual = actual.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-    let worst = actual.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    assert!(actual.len() == expected.len() && worst < tolerance, "{what}: off by {worst}");
+    let worst = actual
+        .iter()
+        .zip(expected)
+        .map(|(a, b)| (a - b).abs())
+        .fold(0.0, f32::max);
+    assert!(
+        actual.len() == expected.len() && worst < tolerance,
+        "{what}: off by {worst}"
+    );
 }
 
 #[test]
 fn loss_gradient_and_steps_are_those_of_pytorch() {
-    let fixture: Fixture =
-        serde_json::from_str(include_str!("../../../tests/fixtures/train/triplet_step.json")).unwrap();
+    let fixture: Fixture = serde_json::from_str(include_str!(
+        "../../../tests/fixtures/train/triplet_step.json"
+    ))
+    .unwrap();
     let weight = Var::from_tensor(&matrix(&fixture.weight)).unwrap();
-    let bias = Var::from_tensor(&Tensor::new(fixture.bias.as_slice(), &Device::Cpu).unwrap()).unwrap();
-    let mut adam = Adam::new(vec![("weight".into(), weight.clone()), ("bias".into(), bias.clone())]).unwrap();
+    let bias =
+        Var::from_tensor(&Tensor::new(fixture.bias.as_slice(), &Device::Cpu).unwrap()).unwrap();
+    let mut adam = Adam::new(vec![
+        ("weight".into(), weight.clone()),
+        ("bias".into(), bias.clone()),
+    ])
+    .unwrap();
     for step in &fixture.steps {
         let embed = |rows: &[Vec<f32>]| {
-            let projected = matrix(rows).matmul(&weight.t().unwrap()).unwrap().broadcast_add(&bias).unwrap();
+            let projected = matrix(rows)
+                .matmul(&weight.t().unwrap())
+                .unwrap()
+                .broadcast_add(&bias)
+                .unwrap();
             normalise_rows(&projected).unwrap()
         };
-        let (query, positive, negative) = (embed(&fixture.query), embed(&fixture.positive), embed(&fixture.negative));
+        let (query, positive, negative) = (
+            embed(&fixture.query),
+            embed(&fixture.positive),
+            embed(&fixture.negative),
+        );
         let loss = triplet_margin_loss(&query, &positive, &negative, fixture.margin).unwrap();
         assert!((loss.to_scalar::<f32>().unwrap() - step.loss).abs() < 1e-6);
         let gradients = loss.backward().unwrap();
-        assert_near("gradient", gradients.get(&weight).unwrap(), &step.weight_gradient.concat(), 1e-6);
+        assert_near(
+            "gradient",
+            gradients.get(&weight).unwrap(),
+            &step.weight_gradient.concat(),
+            1e-6,
+        );
         adam.step(&gradients, fixture.rate).unwrap();
         assert_near("weight", &weight, &step.weight.concat(), 1e-6);
         assert_near("bias", &bias, &step.bias, 1e-6);

@@ -23,7 +23,9 @@ fn eight_places() -> (TripletSet, Vec<f32>) {
     let images: Vec<PathBuf> = (0..24).map(|i| PathBuf::from(i.to_string())).collect();
     let group = |image: u32| (image / 3 * 3)..(image / 3 * 3 + 3);
     let set = TripletSet {
-        positives: (0..24).map(|image| group(image).filter(|&other| other != image).collect()).collect(),
+        positives: (0..24)
+            .map(|image| group(image).filter(|&other| other != image).collect())
+            .collect(),
         near: (0..24).map(|image| group(image).collect()).collect(),
         queries: images.clone(),
         database: images,
@@ -40,7 +42,11 @@ fn head(tokens: &[f32]) -> HeadModel {
 
 fn config(total: u64) -> TrainConfig {
     TrainConfig {
-        schedule: Schedule { peak: 0.02, warm_up: 5, total },
+        schedule: Schedule {
+            peak: 0.02,
+            warm_up: 5,
+            total,
+        },
         batch: 24,
         steps_per_cycle: 20,
         patience: 1000,
@@ -59,11 +65,18 @@ fn train_in(
 ) -> Option<Outcome> {
     let validation = set.clone();
     let mut progress = |progress: Progress<'_>| match progress {
-        Progress::Cycle(record) if record.step >= stop_after => std::panic::panic_any("interrupted"),
+        Progress::Cycle(record) if record.step >= stop_after => {
+            std::panic::panic_any("interrupted")
+        }
         _ => {}
     };
-    let session = Session { folder: folder.to_owned(), identity: "test".into(), progress: &mut progress };
-    let run = std::panic::AssertUnwindSafe(|| model.train(set, &validation, config, session).unwrap());
+    let session = Session {
+        folder: folder.to_owned(),
+        identity: "test".into(),
+        progress: &mut progress,
+    };
+    let run =
+        std::panic::AssertUnwindSafe(|| model.train(set, &validation, config, session).unwrap());
     std::panic::catch_unwind(run).ok()
 }
 
@@ -73,7 +86,11 @@ fn eight_places_are_learnt_to_zero_loss() {
     let folder = tempfile::tempdir().unwrap();
     let outcome = train_in(folder.path(), &head(&tokens), &set, &config(600), u64::MAX).unwrap();
     assert!(outcome.initial.at_1 < 90.0, "{outcome:?}");
-    assert_eq!((outcome.last_loss, outcome.best.at_1), (0.0, 100.0), "{outcome:?}");
+    assert_eq!(
+        (outcome.last_loss, outcome.best.at_1),
+        (0.0, 100.0),
+        "{outcome:?}"
+    );
 }
 
 #[test]
@@ -89,7 +106,11 @@ fn an_interrupted_run_continues_bit_for_bit() {
     assert_eq!(outcome, expected);
     assert_eq!(continued.weights().unwrap(), straight.weights().unwrap());
     let log = |folder: &tempfile::TempDir| -> Vec<_> {
-        crate::train::read_log(folder.path()).unwrap().into_iter().map(|r| (r.step, r.loss, r.recall)).collect()
+        crate::train::read_log(folder.path())
+            .unwrap()
+            .into_iter()
+            .map(|r| (r.step, r.loss, r.recall))
+            .collect()
     };
     assert_eq!(log(&whole), log(&broken));
 }
@@ -102,8 +123,15 @@ fn a_checkpoint_of_other_settings_or_a_broken_one_is_refused() {
     let mut progress = |_: Progress<'_>| {};
     let validation = set.clone();
     let mut attempt = |config: &TrainConfig, identity: &str| {
-        let session = Session { folder: folder.path().to_owned(), identity: identity.into(), progress: &mut progress };
-        head(&tokens).train(&set, &validation, config, session).unwrap_err().to_string()
+        let session = Session {
+            folder: folder.path().to_owned(),
+            identity: identity.into(),
+            progress: &mut progress,
+        };
+        head(&tokens)
+            .train(&set, &validation, config, session)
+            .unwrap_err()
+            .to_string()
     };
     assert!(attempt(&config(60), "test").contains("other settings"));
     assert!(attempt(&config(40), "other data").contains("other data"));
@@ -115,9 +143,15 @@ fn a_checkpoint_of_other_settings_or_a_broken_one_is_refused() {
 fn training_stops_when_validation_no_longer_improves() {
     let (set, tokens) = eight_places();
     let folder = tempfile::tempdir().unwrap();
-    let config = TrainConfig { patience: 2, ..config(100_000) };
+    let config = TrainConfig {
+        patience: 2,
+        ..config(100_000)
+    };
     let outcome = train_in(folder.path(), &head(&tokens), &set, &config, u64::MAX).unwrap();
-    assert!(outcome.stopped_early && outcome.steps < 2_000, "{outcome:?}");
+    assert!(
+        outcome.stopped_early && outcome.steps < 2_000,
+        "{outcome:?}"
+    );
 }
 
 /// Gives every image the same descriptor, and counts the images it is asked for.
@@ -129,9 +163,14 @@ struct Counting {
 
 impl Counting {
     fn new(value: f32) -> Self {
-        let weight =
-            Var::from_tensor(&Tensor::ones((1, 4), candle_core::DType::F32, &candle_core::Device::Cpu).unwrap());
-        Self { weight: weight.unwrap(), value, described: Default::default() }
+        let weight = Var::from_tensor(
+            &Tensor::ones((1, 4), candle_core::DType::F32, &candle_core::Device::Cpu).unwrap(),
+        );
+        Self {
+            weight: weight.unwrap(),
+            value,
+            described: Default::default(),
+        }
     }
 }
 
@@ -156,16 +195,34 @@ fn a_collapsed_model_finds_nothing() {
     for value in [0.5, f32::NAN] {
         let recall = validate(&Counting::new(value), &set, &mut |_| {}).unwrap();
         // 21 images tie with the positives, so not even ten answers reach one.
-        assert_eq!(recall, ValidationRecall { at_1: 0.0, at_5: 0.0, at_10: 0.0 }, "{value}");
+        assert_eq!(
+            recall,
+            ValidationRecall {
+                at_1: 0.0,
+                at_5: 0.0,
+                at_10: 0.0
+            },
+            "{value}"
+        );
     }
     // The same set with a model that sees the places.
     let (_, tokens) = eight_places();
-    let clean: Vec<f32> = tokens.chunks(DIM).enumerate().flat_map(|(i, _)| one_hot(i / 3)).collect();
+    let clean: Vec<f32> = tokens
+        .chunks(DIM)
+        .enumerate()
+        .flat_map(|(i, _)| one_hot(i / 3))
+        .collect();
     let cache = || PooledTokens::new(DIM, clean.clone(), clean.clone()).unwrap();
     let identity: Vec<f32> = (0..8).flat_map(one_hot).collect();
     let folder = tempfile::tempdir().unwrap();
     let model = HeadModel::new(&identity, &[0.0; 8], cache(), cache()).unwrap();
-    assert_eq!(train_in(folder.path(), &model, &set, &config(20), u64::MAX).unwrap().initial.at_1, 100.0);
+    assert_eq!(
+        train_in(folder.path(), &model, &set, &config(20), u64::MAX)
+            .unwrap()
+            .initial
+            .at_1,
+        100.0
+    );
 }
 
 fn one_hot(place: usize) -> [f32; DIM] {
@@ -174,35 +231,67 @@ fn one_hot(place: usize) -> [f32; DIM] {
 
 #[test]
 fn a_cycle_costs_its_queries_their_positives_and_the_pool_however_large_the_data() {
-    let paths =
-        |side: &str, n: usize| -> Vec<PathBuf> { (0..n).map(|i| PathBuf::from(format!("{side}{i}"))).collect() };
+    let paths = |side: &str, n: usize| -> Vec<PathBuf> {
+        (0..n)
+            .map(|i| PathBuf::from(format!("{side}{i}")))
+            .collect()
+    };
     let (asking, answering) = (3000usize, 9000usize);
-    let positives: Vec<Vec<u32>> = (0..asking as u32).map(|query| vec![3 * query, 3 * query + 1]).collect();
-    let set =
-        TripletSet { queries: paths("q", asking), database: paths("d", answering), near: positives.clone(), positives };
-    let config = TrainConfig { batch: 4, mining_pool: 100, negatives: 3, ..config(1000) };
+    let positives: Vec<Vec<u32>> = (0..asking as u32)
+        .map(|query| vec![3 * query, 3 * query + 1])
+        .collect();
+    let set = TripletSet {
+        queries: paths("q", asking),
+        database: paths("d", answering),
+        near: positives.clone(),
+        positives,
+    };
+    let config = TrainConfig {
+        batch: 4,
+        mining_pool: 100,
+        negatives: 3,
+        ..config(1000)
+    };
     let model = Counting::new(1.0);
     let mut adam = Adam::new(model.variables()).unwrap();
     let usable: Vec<usize> = set.usable().collect();
     let (mut steps, mut announced) = (Vec::new(), 0);
     let mut progress = |progress: Progress<'_>| match progress {
         Progress::Step { steps: step, .. } => steps.push(step),
-        Progress::Described { purpose: "mining", of, .. } => announced = of,
+        Progress::Described {
+            purpose: "mining",
+            of,
+            ..
+        } => announced = of,
         _ => panic!("{progress:?}"),
     };
-    let cycle = Cycle { model: &model, set: &set, config: &config };
-    let loss = cycle.run(&usable, &mut adam, 40..45, &mut progress).unwrap();
+    let cycle = Cycle {
+        model: &model,
+        set: &set,
+        config: &config,
+    };
+    let loss = cycle
+        .run(&usable, &mut adam, 40..45, &mut progress)
+        .unwrap();
     // All descriptors coincide, so every triplet costs the margin.
     assert!((f64::from(loss) - config.margin).abs() < 1e-6, "{loss}");
     assert_eq!(steps, [41, 42, 43, 44, 45]);
     let (asked, trained) = (5 * 4, 5 * 3 * 4);
     let described = model.described.borrow().len();
     assert_eq!(described, announced + trained);
-    assert!((100..=asked + 2 * asked + 100).contains(&announced), "{announced}");
+    assert!(
+        (100..=asked + 2 * asked + 100).contains(&announced),
+        "{announced}"
+    );
     // What was drawn follows from seed and step alone.
     let triplets = |range: Range<u64>| -> Vec<Vec<u32>> {
-        let draws = cycle.draw(&usable, &draw_pool(answering, 100, 1), range).unwrap();
-        draws.iter().map(|step| step.iter().map(|draw| draw.query).collect()).collect()
+        let draws = cycle
+            .draw(&usable, &draw_pool(answering, 100, 1), range)
+            .unwrap();
+        draws
+            .iter()
+            .map(|step| step.iter().map(|draw| draw.query).collect())
+            .collect()
     };
     assert_eq!(triplets(40..45)[2..], triplets(42..45));
 }
@@ -211,10 +300,17 @@ fn a_cycle_costs_its_queries_their_positives_and_the_pool_however_large_the_data
 fn queries_without_a_negative_in_the_pool_are_not_asked() {
     let (set, _) = eight_places();
     let model = Counting::new(1.0);
-    let cycle = Cycle { model: &model, set: &set, config: &config(20) };
+    let cycle = Cycle {
+        model: &model,
+        set: &set,
+        config: &config(20),
+    };
     let usable: Vec<usize> = set.usable().collect();
     // Images 0 to 2 are near to each other, so only the other places can be asked against them.
     let draws = cycle.draw(&usable, &[0, 2], 0..10).unwrap();
     assert!(draws.iter().flatten().all(|draw| draw.query > 2));
-    assert!(matches!(cycle.draw(&usable[..3], &[0, 2], 0..1), Err(TrainError::NoTriplets(_))));
+    assert!(matches!(
+        cycle.draw(&usable[..3], &[0, 2], 0..1),
+        Err(TrainError::NoTriplets(_))
+    ));
 }
