@@ -8,14 +8,15 @@
 //! `PLACEFORMER_BENCH_EXPORT=DIR` writes the same data as safetensors for
 //! `benches/peers/rerank_opencv.py`, along with our inlier counts, and stops.
 
+use placeformer_vision::extract::pack;
 use criterion::{BenchmarkId, Criterion};
-use placeformer::bench::baselines::{self, joined};
-use placeformer::bench::scenes::{CANDIDATES, CAPS, DIM, RerankScene};
-use placeformer::bench::store_scene;
-use placeformer::kernels::simd;
-use placeformer::rerank::{RerankConfig, Reranked, Reranker};
-use placeformer::store::PlaceStore;
-use placeformer::types::{PackedPatches, ScaleSet};
+use placeformer_lab::bench::baselines::{self, joined};
+use placeformer_lab::bench::scenes::{CANDIDATES, CAPS, DIM, RerankScene};
+use placeformer_lab::bench::store_scene;
+use placeformer_kernels::simd;
+use placeformer_vision::rerank::{RerankConfig, Reranked, Reranker};
+use placeformer_store::PlaceStore;
+use placeformer_core::types::{PackedPatches, ScaleSet};
 use rayon::prelude::*;
 use std::hint::black_box;
 use std::path::Path;
@@ -53,9 +54,9 @@ fn export(dir: &Path, percent: u32, scene: &RerankScene) {
             .flat_map(|(_, c)| c.iter().flatten().map(|&v| v as f32)),
     );
     let reranker = Reranker::new(RerankConfig::default());
-    let query = PackedPatches::quantise(&scene.query);
+    let query = pack(&scene.query);
     let scores = scene.candidates.iter().flat_map(|c| {
-        let score = reranker.score(&query, &PackedPatches::quantise(c));
+        let score = reranker.score(&query, &pack(c));
         score
             .combinations
             .into_iter()
@@ -131,11 +132,11 @@ fn matches(
 
 /// The homographies alone, on one thread, and what a store adds.
 fn bench_parts(criterion: &mut Criterion, percent: u32, scene: &RerankScene) {
-    let query = PackedPatches::quantise(&scene.query);
+    let query = pack(&scene.query);
     let candidates: Vec<_> = scene
         .candidates
         .iter()
-        .map(PackedPatches::quantise)
+        .map(pack)
         .collect();
     let reranker = Reranker::new(RerankConfig::default());
     let problems = matches(&reranker, &query, &candidates);
@@ -178,11 +179,11 @@ fn bench_parts(criterion: &mut Criterion, percent: u32, scene: &RerankScene) {
 }
 
 fn bench(criterion: &mut Criterion, percent: u32, scene: &RerankScene) {
-    let query = PackedPatches::quantise(&scene.query);
+    let query = pack(&scene.query);
     let candidates: Vec<_> = scene
         .candidates
         .iter()
-        .map(PackedPatches::quantise)
+        .map(pack)
         .collect();
     let reranker = Reranker::new(RerankConfig::default());
     let matching = Reranker::new(RerankConfig {

@@ -8,14 +8,14 @@
 //! An environment variable names its key with `__` between the levels:
 //! `PLACEFORMER_HTTP__LISTEN=0.0.0.0:80` is `listen` of `[http]`.
 
-use crate::extract::{ExtractConfig, HeadChoice, Precision, Preset};
+use placeformer_vision::extract::{ExtractConfig, HeadChoice, Precision, Preset};
 use crate::http::{AuthConfig, HttpConfig};
-use crate::image::ImageConfig;
+use placeformer_vision::image::ImageConfig;
 use crate::ops::LogConfig;
 use crate::pipeline::PipelineConfig;
-use crate::rerank::RerankConfig;
-use crate::store::StoreConfig;
-use crate::types::InvalidValue;
+use placeformer_vision::rerank::RerankConfig;
+use placeformer_store::StoreConfig;
+use placeformer_core::types::InvalidValue;
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};

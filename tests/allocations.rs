@@ -1,15 +1,16 @@
 //! In the steady state, the stages of a query allocate their answers and little else: buffers are
 //! kept, matrices of similarities and scores never exist.
 
-use placeformer::bench::scenes::{CANDIDATES, RerankScene, index_entry, unit_vector};
-use placeformer::extract::{
+use placeformer_vision::extract::pack;
+use placeformer_lab::bench::scenes::{CANDIDATES, RerankScene, index_entry, unit_vector};
+use placeformer_vision::extract::{
     BlockWeights, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm, Precision, Preset,
     VitWeights,
 };
-use placeformer::kernels::Simd;
-use placeformer::rerank::{RerankConfig, Reranker};
-use placeformer::search::MapIndex;
-use placeformer::types::{ImageSize, ImageTensor, PackedPatches, ReferenceFilter};
+use placeformer_kernels::Simd;
+use placeformer_vision::rerank::{RerankConfig, Reranker};
+use placeformer_vision::search::MapIndex;
+use placeformer_core::types::{ImageSize, ImageTensor, PackedPatches, ReferenceFilter};
 use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
 use std::alloc::System;
 use std::sync::Mutex;
@@ -127,11 +128,11 @@ fn extraction_allocates_its_answer() {
 #[test]
 fn reranking_allocates_no_matrices() {
     let scene = RerankScene::new(0.4);
-    let query = PackedPatches::quantise(&scene.query);
+    let query = pack(&scene.query);
     let candidates: Vec<_> = scene
         .candidates
         .iter()
-        .map(PackedPatches::quantise)
+        .map(pack)
         .collect();
     let reranker = Reranker::new(RerankConfig::default());
     let bytes = steady_bytes(|| {

@@ -4,7 +4,7 @@
 #[path = "common/town.rs"]
 mod town;
 
-use placeformer::types::Calibration;
+use placeformer_core::types::Calibration;
 use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output};

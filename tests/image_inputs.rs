@@ -2,10 +2,10 @@
 
 use exif::{Field, In, Rational, Tag, Value, experimental::Writer};
 use image::{DynamicImage, ImageFormat};
-use placeformer::image::{
+use placeformer_vision::image::{
     ImageConfig, ImageError, RgbImage, decode, encode_jpeg, encode_png, load_tensor, read_exif,
 };
-use placeformer::types::ImageSize;
+use placeformer_core::types::ImageSize;
 use proptest::prelude::*;
 use std::io::Cursor;
 use std::path::Path;
@@ -344,8 +344,8 @@ fn a_large_photo_is_reduced_while_decoding_and_looks_the_same() {
                 let channel = at / plane;
                 let level = f32::from(whole.pixels[at % plane * 3 + channel]) / 255.0;
                 let (mean, deviation) = (
-                    placeformer::image::MEAN[channel],
-                    placeformer::image::DEVIATION[channel],
+                    placeformer_vision::image::MEAN[channel],
+                    placeformer_vision::image::DEVIATION[channel],
                 );
                 (tensor.data[at] - (level - mean) / deviation).abs()
             })

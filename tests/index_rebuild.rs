@@ -7,13 +7,13 @@ mod support;
 
 use bytes::Bytes;
 use placeformer::config::Config;
-use placeformer::error::ErrorCode;
+use placeformer_core::error::ErrorCode;
 use placeformer::pipeline::{IngestRequest, QueryOptions, QueryRequest, Service};
-use placeformer::search::{IndexBuilder, IndexEntry, MapIndex};
-use placeformer::store::{
+use placeformer_vision::search::{IndexBuilder, IndexEntry, MapIndex};
+use placeformer_store::{
     Inserted, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, apply_patch,
 };
-use placeformer::types::{
+use placeformer_core::types::{
     ContentHash, GLOBAL_DIM, GeoCircle, GeoPoint, MapName, NewReference, Reference,
     ReferenceFields, ReferenceFilter, ReferenceId,
 };

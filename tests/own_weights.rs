@@ -1,11 +1,11 @@
 //! A server of one's own weights and head, as `train` writes them, and where its settings come
 //! from: the real binary.
 
-use placeformer::extract::{
+use placeformer_vision::extract::{
     Aggregate, BlockWeights, ExtractConfig, Extractor, Head, HeadChoice, Linear, Norm, Preset,
     VitWeights,
 };
-use placeformer::types::{GLOBAL_DIM, ImageSize};
+use placeformer_core::types::{GLOBAL_DIM, ImageSize};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::io::{BufRead, BufReader};

@@ -3,11 +3,11 @@
 #[path = "common/places.rs"]
 mod places;
 
-use placeformer::error::ErrorCode;
-use placeformer::store::{
+use placeformer_core::error::ErrorCode;
+use placeformer_store::{
     Inserted, NewHead, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, StoreError,
 };
-use placeformer::types::{
+use placeformer_core::types::{
     Calibration, ConfidenceCurve, ConfidenceWeights, GLOBAL_DIM, GeoPoint, Heading, MapName,
     ModelId, NewReference, Reference, ReferenceId, RerankId,
 };

@@ -4,8 +4,8 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use placeformer::image::{ImageConfig, decode, load_tensor, read_exif};
-use placeformer::types::ImageSize;
+use placeformer_vision::image::{ImageConfig, decode, load_tensor, read_exif};
+use placeformer_core::types::ImageSize;
 
 // libFuzzer's own hook, which is taken out here, aborts before anything could contain the panic.
 fuzz_target!(init: drop(std::panic::take_hook()), |bytes: &[u8]| {

@@ -5,7 +5,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use placeformer::store::codec::{decode, decode_f16, decode_f32, encode};
+use placeformer_store::codec::{decode, decode_f16, decode_f32, encode};
 
 fuzz_target!(|bytes: &[u8]| {
     let _ = (decode_f32(bytes), decode_f16(bytes));

@@ -2,7 +2,7 @@
 
 use crate::cli::output::say;
 use crate::config::{Config, Overrides};
-use crate::store::SqliteStore;
+use placeformer_store::SqliteStore;
 use anyhow::{Context, ensure};
 use std::path::PathBuf;
 

@@ -1,6 +1,6 @@
 //! Flags that say how data sets are read, for the subcommands that read them.
 
-use crate::eval::datasets::{DatasetOptions, Split};
+use placeformer_lab::datasets::{DatasetOptions, Split};
 
 /// What is taken of a data set in the layout in which it is distributed.
 #[derive(Debug, Clone, clap::Args)]

@@ -2,8 +2,8 @@
 
 use super::model_args::ModelOptions;
 use crate::cli::output::{OutputError, say};
-use crate::extract::{ExtractionTrace, Extractor, TraceArray, TraceValues};
-use crate::image::{ImageConfig, load_tensor};
+use placeformer_vision::extract::{ExtractionTrace, Extractor, TraceArray, TraceValues};
+use placeformer_vision::image::{ImageConfig, load_tensor};
 use anyhow::Context;
 use clap::Args;
 use safetensors::tensor::{Dtype, TensorView};

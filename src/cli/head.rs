@@ -3,13 +3,13 @@
 use super::model_args::ModelOptions;
 use super::train::{HeadTrainArgs, train_head};
 use crate::cli::output::say;
-use crate::eval::datasets::list_images as images_below;
-use crate::extract::{
+use placeformer_lab::datasets::list_images as images_below;
+use placeformer_vision::extract::{
     Aggregate, Covariance, ExtractConfig, Extractor, Head, HeadChoice, VladWords,
     half_whitened_head_of_few, hash_file, sample_tokens,
 };
-use crate::image::{ImageConfig, load_tensor};
-use crate::types::ImageTensor;
+use placeformer_vision::image::{ImageConfig, load_tensor};
+use placeformer_core::types::ImageTensor;
 use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};

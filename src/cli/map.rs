@@ -4,9 +4,9 @@
 use super::client::{ServerArgs, ServerClient};
 use crate::cli::output::{say, say_part};
 use crate::config::{Config, Overrides};
-use crate::extract::Head;
-use crate::store::{HeadExchange, NewHead};
-use crate::types::MapName;
+use placeformer_vision::extract::Head;
+use placeformer_store::{HeadExchange, NewHead};
+use placeformer_core::types::MapName;
 use anyhow::{Context, bail, ensure};
 use clap::Subcommand;
 use indicatif::{ProgressBar, ProgressStyle};

@@ -2,11 +2,11 @@
 
 use super::model_args::ModelOptions;
 use crate::cli::output::{OutputError, say};
-use crate::eval::evidence::{Seen, picture};
-use crate::extract::Extractor;
-use crate::image::{ImageConfig, encode_jpeg, encode_png};
-use crate::rerank::{CombinationMatch, RerankConfig, Reranker};
-use crate::types::ScaleSet;
+use placeformer_lab::eval::evidence::{Seen, picture};
+use placeformer_vision::extract::Extractor;
+use placeformer_vision::image::{ImageConfig, encode_jpeg, encode_png};
+use placeformer_vision::rerank::{CombinationMatch, RerankConfig, Reranker};
+use placeformer_core::types::ScaleSet;
 use anyhow::{Context, bail};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -47,7 +47,7 @@ pub fn run(args: MatchArgs) -> anyhow::Result<()> {
         ..Default::default()
     };
     rerank.check()?;
-    crate::kernels::self_check()?;
+    placeformer_kernels::self_check()?;
     let encode = if args.no_picture {
         None
     } else {
@@ -81,7 +81,7 @@ pub fn run(args: MatchArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-type Encode = fn(&crate::image::RgbImage) -> anyhow::Result<Vec<u8>>;
+type Encode = fn(&placeformer_vision::image::RgbImage) -> anyhow::Result<Vec<u8>>;
 
 /// Chosen before the model is loaded, so that a wrong name costs nothing.
 fn encoder(path: &Path) -> anyhow::Result<Encode> {
@@ -146,7 +146,7 @@ fn as_json(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) -> Valu
         json!({ "key_patches": seen.patches.counts, "input_size": input })
     };
     let combination = |found: &CombinationMatch| {
-        let pair = |pair: &crate::rerank::Correspondence| {
+        let pair = |pair: &placeformer_vision::rerank::Correspondence| {
             let (from, to) = (pair.query as usize, pair.reference as usize);
             json!({
                 "query": query.patches.centre(from),

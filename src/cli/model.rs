@@ -1,8 +1,8 @@
 //! Obtain and inspect models.
 
 use crate::cli::output::say;
-use crate::extract::pull::{model_path, pull_model, resolve_model};
-use crate::extract::{
+use placeformer_models::{model_path, pull_model, resolve_model};
+use placeformer_vision::extract::{
     ExtractConfig, ExtractError, Extractor, HeadChoice, Preset, Record, VitWeights,
 };
 use anyhow::Context;
@@ -85,7 +85,7 @@ fn info(args: InfoArgs) -> anyhow::Result<()> {
         heads: args.heads,
         ..ExtractConfig::default()
     };
-    let record = crate::extract::verify_weights(&path)?;
+    let record = placeformer_vision::extract::verify_weights(&path)?;
     let weights = VitWeights::load(&path, preset, args.heads)?;
     let built_in = Extractor::from_weights(&config, &weights, &HeadChoice::Default);
     let (extractor, head) = match built_in {
@@ -98,7 +98,7 @@ fn info(args: InfoArgs) -> anyhow::Result<()> {
     };
     let sha256 = match &record {
         Some(Record { sha256, .. }) => sha256.clone(),
-        None => crate::extract::hash_file(&path).with_context(|| path.display().to_string())?,
+        None => placeformer_vision::extract::hash_file(&path).with_context(|| path.display().to_string())?,
     };
     let report = json!({
         "preset": preset,

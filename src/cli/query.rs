@@ -2,7 +2,7 @@
 
 use super::client::{ServerArgs, ServerClient};
 use crate::cli::output::{OutputError, say};
-use crate::types::MapName;
+use placeformer_core::types::MapName;
 use serde_json::Value;
 use std::path::PathBuf;
 

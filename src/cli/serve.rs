@@ -6,11 +6,11 @@
 
 use crate::cli::output::{say, say_part};
 use crate::config::{Config, Overrides};
-use crate::extract::{ExtractConfig, Extractor};
+use placeformer_vision::extract::{ExtractConfig, Extractor};
 use crate::http::{AppState, serve};
 use crate::ops::{Health, Metrics, disk, logging, shutdown};
 use crate::pipeline::{DescriptorSource, Parts, Service};
-use crate::store::{PlaceStore, SqliteStore, StoreConfig};
+use placeformer_store::{PlaceStore, SqliteStore, StoreConfig};
 use anyhow::{Context, anyhow};
 use std::future::Future;
 use std::path::{Path, PathBuf};
@@ -51,7 +51,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         return Ok(());
     }
     logging::init(&config.log)?;
-    crate::kernels::self_check()?;
+    placeformer_kernels::self_check()?;
     let loaders = loaders(&config);
     serve_until_signal(config, loaders)
 }

@@ -1,8 +1,8 @@
 //! Render synthetic street scenes.
 
 use crate::cli::output::say;
-use crate::synth::{Condition, DatasetOptions, image_count, write_dataset};
-use crate::types::ImageSize;
+use placeformer_lab::synth::{Condition, DatasetOptions, image_count, write_dataset};
+use placeformer_core::types::ImageSize;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::PathBuf;
 
@@ -33,7 +33,7 @@ pub struct SynthArgs {
 fn parse_size(text: &str) -> Result<ImageSize, String> {
     let size: ImageSize = text
         .parse()
-        .map_err(|error: crate::types::InvalidValue| error.to_string())?;
+        .map_err(|error: placeformer_core::types::InvalidValue| error.to_string())?;
     if (16..=4096).contains(&size.width) && (16..=4096).contains(&size.height) {
         Ok(size)
     } else {

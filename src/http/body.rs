@@ -11,7 +11,7 @@
 use super::AppState;
 use super::limits::Held;
 use super::problem::ApiError;
-use crate::error::ErrorCode;
+use placeformer_core::error::ErrorCode;
 use axum::body::{Body, HttpBody};
 use axum::extract::{FromRequest, Multipart, Query, Request};
 use axum::http::{HeaderMap, Uri, header};

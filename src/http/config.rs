@@ -1,6 +1,6 @@
 //! Settings of the web surface.
 
-use crate::types::InvalidValue;
+use placeformer_core::types::InvalidValue;
 use serde::{Deserialize, Serialize};
 
 /// Limits and timeouts of connections and bodies.

@@ -1,7 +1,7 @@
 //! How fast one caller may ask, and how many bytes of bodies are held at once.
 
 use super::config::AuthConfig;
-use crate::error::ErrorCode;
+use placeformer_core::error::ErrorCode;
 use crate::http::problem::ApiError;
 use crate::ops::Metrics;
 use crate::ops::metrics::Rejection;

@@ -23,11 +23,11 @@ pub mod serve;
 pub use config::{ApiKey, AuthConfig, HttpConfig, Role};
 pub use serve::serve;
 
-use crate::error::ErrorCode;
+use placeformer_core::error::ErrorCode;
 use crate::ops::metrics::Rejection;
 use crate::ops::{Health, Metrics};
 use crate::pipeline::Service;
-use crate::types::InvalidValue;
+use placeformer_core::types::InvalidValue;
 use auth::Keys;
 use axum::Router;
 use axum::extract::DefaultBodyLimit;

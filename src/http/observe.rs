@@ -2,7 +2,7 @@
 
 use super::AppState;
 use super::problem::{self, ApiError};
-use crate::error::ErrorCode;
+use placeformer_core::error::ErrorCode;
 use crate::ops::metrics::Rejection;
 use axum::extract::{MatchedPath, Request, State};
 use axum::http::{HeaderValue, Method};

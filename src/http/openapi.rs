@@ -2,7 +2,7 @@
 
 use super::problem::{PROBLEM_JSON, ProblemBody};
 use super::{examples, routes};
-use crate::error::ErrorCode;
+use placeformer_core::error::ErrorCode;
 use crate::ops::Metrics;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;

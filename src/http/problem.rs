@@ -5,9 +5,9 @@
 //! whatever else answers with an error status (the router's 404 and 405, a panic) into the same
 //! shape.
 
-use crate::error::ErrorCode;
+use placeformer_core::error::ErrorCode;
 use crate::pipeline::PipelineError;
-use crate::types::{InvalidName, InvalidValue};
+use placeformer_core::types::{InvalidName, InvalidValue};
 use axum::body::Body;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};

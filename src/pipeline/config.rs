@@ -1,6 +1,6 @@
 //! Settings of the composition.
 
-use crate::types::InvalidValue;
+use placeformer_core::types::InvalidValue;
 use serde::{Deserialize, Serialize};
 
 /// Bounds and defaults that belong to no single stage.

@@ -8,9 +8,9 @@
 use super::admission::Ticket;
 use super::blocking::{Panicked, blocking};
 use super::{DescriptorSource, PipelineError, Timings};
-use crate::image::ImageConfig;
+use placeformer_vision::image::ImageConfig;
 use crate::ops::{Metrics, Stage};
-use crate::types::{Deadline, Descriptor, ImageTensor};
+use placeformer_core::types::{Deadline, Descriptor, ImageTensor};
 use bytes::Bytes;
 use std::future::Future;
 use std::sync::Arc;

@@ -5,13 +5,13 @@ use super::blocking::blocking;
 use super::extraction::Purpose;
 use super::maps::LiveMap;
 use super::{PipelineError, Service, Timings, Verdict};
-use crate::error::ErrorCode;
+use placeformer_core::error::ErrorCode;
 use crate::ops::Stage;
 use crate::ops::metrics::Rejection;
-use crate::rerank::{PairScore, Reranked};
-use crate::search::Neighbour;
-use crate::store::StoreError;
-use crate::types::{
+use placeformer_vision::rerank::{PairScore, Reranked};
+use placeformer_vision::search::Neighbour;
+use placeformer_store::StoreError;
+use placeformer_core::types::{
     Deadline, Descriptor, MapName, ModelId, Reference, ReferenceFilter, ReferenceId,
 };
 use bytes::Bytes;

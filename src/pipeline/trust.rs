@@ -3,7 +3,7 @@
 
 use super::PipelineError;
 use super::query::QueryResult;
-use crate::types::{Calibration, ConfidenceCurve, MapName, ModelId, RerankId};
+use placeformer_core::types::{Calibration, ConfidenceCurve, MapName, ModelId, RerankId};
 
 /// Calibrations that ship, one per model.
 const BUILT_IN: [&str; 1] = [include_str!(
@@ -126,9 +126,9 @@ impl Trust {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::extract::Head;
-    use crate::rerank::{PairScore, RerankConfig};
-    use crate::types::{ConfidenceWeights, ContentHash, Reference, ReferenceFields, ReferenceId};
+    use placeformer_vision::extract::Head;
+    use placeformer_vision::rerank::{PairScore, RerankConfig};
+    use placeformer_core::types::{ConfidenceWeights, ContentHash, Reference, ReferenceFields, ReferenceId};
     use time::OffsetDateTime;
 
     fn curve(bias: f64, score: f64) -> ConfidenceCurve {

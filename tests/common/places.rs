@@ -1,7 +1,7 @@
 //! Made-up references for tests of the store and the index.
 
 use half::f16;
-use placeformer::types::{
+use placeformer_core::types::{
     ContentHash, Descriptor, ExternalId, GLOBAL_DIM, GeoPoint, Heading, MapName, ModelId,
     NewReference, PackedPatches, PatchGrid, PoolingStride, ReferenceFields,
 };

@@ -3,7 +3,7 @@
 use crate::support::{Answer, App, FakeSource, picture};
 use axum::body::Body;
 use axum::http::Request;
-use placeformer::error::ErrorCode;
+use placeformer_core::error::ErrorCode;
 use placeformer::http::{ApiKey, AppState, AuthConfig, HttpConfig, Role, app};
 use placeformer::ops::{Health, Metrics};
 use sha2::Digest;

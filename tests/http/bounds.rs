@@ -4,11 +4,11 @@
 use crate::support::{App, FakeSource, Gate, PATIENCE, multipart, picture, until};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use placeformer::store::{
+use placeformer_store::{
     Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined,
     ReferencePatch, SqliteStore, StoreError, VerifyReport,
 };
-use placeformer::types::{
+use placeformer_core::types::{
     Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
 };
 use serde_json::json;

@@ -4,7 +4,7 @@ use crate::support::{Answer, App, FakeSource};
 use axum::body::Body;
 use axum::http::Request;
 use placeformer::http::{ApiKey, Role};
-use placeformer::rerank::RerankConfig;
+use placeformer_vision::rerank::RerankConfig;
 use serde_json::{Value, json};
 use std::sync::Arc;
 

@@ -4,9 +4,9 @@ use crate::process::Server;
 use crate::support::{App, BACKBONE, FakeSource, file_of, head, picture};
 use axum::body::Body;
 use axum::http::Request;
-use placeformer::extract::{Aggregate, Head};
+use placeformer_vision::extract::{Aggregate, Head};
 use placeformer::http::{ApiKey, Role};
-use placeformer::store::crash_points;
+use placeformer_store::crash_points;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -255,7 +255,7 @@ async fn a_calibration_does_not_outlive_the_head_it_was_fitted_for() {
     let old = add(&app, "m", 1).await["model"].clone();
     let curve = json!({"weights": {"bias": 5.0, "score": 0.0, "distance": -8.0}, "threshold": 0.75, "right": 80,
         "wrong": 60, "without_match": 50, "precision": 0.99, "recall": 0.9, "expected_calibration_error": 0.02});
-    let calibration = json!({"format": 1, "model": old, "rerank": placeformer::rerank::RerankConfig::default().id(),
+    let calibration = json!({"format": 1, "model": old, "rerank": placeformer_vision::rerank::RerankConfig::default().id(),
         "data": "made up", "target_precision": 0.99, "reranked": curve, "global": curve});
     let put = || {
         app.put(

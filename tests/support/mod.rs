@@ -2,18 +2,19 @@
 //! descriptor source that derives everything from the image's content.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
+use placeformer_vision::extract::pack;
 use axum::body::Body;
 use axum::http::{HeaderMap, Request, StatusCode};
 use axum::response::Response;
 use http_body_util::BodyExt;
 use placeformer::config::Config;
-use placeformer::extract::{Aggregate, ExtractError, Head};
+use placeformer_vision::extract::{Aggregate, ExtractError, Head};
 use placeformer::http::{AppState, app};
-use placeformer::image::{ImageConfig, ImageError, load_tensor};
+use placeformer_vision::image::{ImageConfig, ImageError, load_tensor};
 use placeformer::ops::{Health, Metrics};
 use placeformer::pipeline::{DescriptorSource, Parts, Service};
-use placeformer::store::{PlaceStore, SqliteStore, StoreConfig};
-use placeformer::types::{
+use placeformer_store::{PlaceStore, SqliteStore, StoreConfig};
+use placeformer_core::types::{
     Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid,
     PoolingStride, ScaleKeyPatches,
 };
@@ -277,7 +278,7 @@ fn describe(image: &ImageTensor) -> Descriptor {
     Descriptor {
         global,
         pooled,
-        patches: PackedPatches::quantise(&patches),
+        patches: pack(&patches),
     }
 }
 
@@ -497,7 +498,7 @@ impl Answer {
     #[track_caller]
     pub fn problem(&self, code: &str) -> &str {
         assert_eq!(self.json["code"], code, "{}", self.text);
-        let row = placeformer::error::ErrorCode::ALL
+        let row = placeformer_core::error::ErrorCode::ALL
             .iter()
             .find(|row| row.as_str() == code)
             .unwrap();

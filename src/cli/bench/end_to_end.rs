@@ -1,16 +1,16 @@
 //! `POST /query` through a server process, over loopback.
 
 use super::peers::{Measured, Peers};
-use crate::bench::filled::FilledStore;
-use crate::bench::{fill_with_streets, scenes::street, street_map};
+use placeformer_lab::bench::filled::FilledStore;
+use placeformer_lab::bench::{fill_with_streets, scenes::street, street_map};
 use crate::cli::child_server::ChildServer;
 use crate::cli::client::resident_bytes;
 use crate::cli::output::say;
 use crate::cli::serve::{Loaders, open_model, serve_until_signal};
 use crate::config::Config;
-use crate::extract::{ExtractConfig, Extractor};
-use crate::store::{SqliteStore, StoreConfig};
-use crate::types::ImageSize;
+use placeformer_vision::extract::{ExtractConfig, Extractor};
+use placeformer_store::{SqliteStore, StoreConfig};
+use placeformer_core::types::ImageSize;
 use anyhow::{Context, ensure};
 use hdrhistogram::Histogram;
 use serde::Serialize;
@@ -67,7 +67,7 @@ impl EndToEnd<'_> {
             .collect::<Result<_, _>>()?;
         let photos: Arc<[bytes::Bytes]> = photos.into_iter().map(bytes::Bytes::from).collect();
         let prepare = |(python, weights)| {
-            let drawn = (self.drawn, crate::bench::REFERENCE_SIZE);
+            let drawn = (self.drawn, placeformer_lab::bench::REFERENCE_SIZE);
             Peers::prepare(
                 python,
                 self.folder,

@@ -5,11 +5,11 @@ mod peers;
 mod table;
 
 use super::model_args::ModelOptions;
-use crate::bench::{Bench, BenchError, Limits, NAMES, Row};
+use placeformer_lab::bench::{Bench, BenchError, Limits, NAMES, Row};
 use crate::cli::output::say;
-use crate::extract::pull::resolve_weights;
-use crate::extract::{ExtractError, Extractor, VitWeights};
-use crate::kernels;
+use placeformer_models::resolve_weights;
+use placeformer_vision::extract::{ExtractError, Extractor, VitWeights};
+use placeformer_kernels;
 use anyhow::{Context, ensure};
 use end_to_end::{EndToEnd, EndToEndRow};
 use indicatif::{ProgressBar, ProgressStyle};

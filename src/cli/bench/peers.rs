@@ -1,8 +1,8 @@
 //! The same query as users assemble it today, from a script beside the benches, in the same run.
 
-use crate::bench::scenes::street;
-use crate::extract::Extractor;
-use crate::types::ImageSize;
+use placeformer_lab::bench::scenes::street;
+use placeformer_vision::extract::Extractor;
+use placeformer_core::types::ImageSize;
 use anyhow::{Context, ensure};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

@@ -2,7 +2,7 @@
 
 use super::peers::Measured;
 use super::{EndToEndRow, Report};
-use crate::bench::Row;
+use placeformer_lab::bench::Row;
 use std::fmt::Write;
 
 /// What it ran on.

@@ -10,7 +10,7 @@ mod report;
 use super::client::{ServerArgs, ServerClient};
 use crate::cli::child_server::ChildServer;
 use crate::cli::output::say;
-use crate::extract::{ExtractConfig, pull::resolve_weights};
+use placeformer_vision::extract::{ExtractConfig, pull::resolve_weights};
 use anyhow::{Context, bail, ensure};
 use report::{Asked, Evidence};
 use serde_json::Value;

@@ -1,10 +1,10 @@
 //! What the demo showed: a table on the terminal, a page with pictures.
 
 use crate::cli::output::{OutputError, say};
-use crate::draw::{jpeg_data_uri, thumbnail};
-use crate::eval::datasets::UtmName;
-use crate::eval::report::{escape, page, table};
-use crate::image::{ImageConfig, decode};
+use placeformer_lab::draw::{jpeg_data_uri, thumbnail};
+use placeformer_lab::datasets::UtmName;
+use placeformer_lab::eval::report::{escape, page, table};
+use placeformer_vision::image::{ImageConfig, decode};
 use anyhow::Context;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};

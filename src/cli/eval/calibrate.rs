@@ -4,9 +4,9 @@ use super::{CacheArgs, DataArgs, Described, RerankArgs, write};
 use crate::cli::client::{ServerArgs, ServerClient};
 use crate::cli::model_args::ModelOptions;
 use crate::cli::output::say_part;
-use crate::eval::calibrate::{BestAnswers, LeaveOut, OwnPlaces, Purpose, calibrate};
-use crate::eval::features::GlobalKind;
-use crate::types::{Calibration, MapName};
+use placeformer_lab::eval::calibrate::{BestAnswers, LeaveOut, OwnPlaces, Purpose, calibrate};
+use placeformer_lab::eval::features::GlobalKind;
+use placeformer_core::types::{Calibration, MapName};
 use anyhow::{Context, ensure};
 use std::path::PathBuf;
 

@@ -5,18 +5,18 @@ mod calibrate;
 use super::data_args::ReadArgs;
 use super::model_args::ModelOptions;
 use crate::cli::output::say_part;
-use crate::eval::ablate::{Ablation, Base, ablate};
-use crate::eval::calibrate::{LeaveOut, OwnPlaces};
-use crate::eval::datasets::{self, Dataset, DatasetKind, DatasetOptions};
-use crate::eval::features::{Describe, FeatureCache, Features, GlobalKind, ModelDescriber};
-use crate::eval::report::{Painter, gallery};
-use crate::eval::run::{Answer, QuerySeconds, rerank_all, search_all};
-use crate::eval::summary::{Asked, RunConfig, Summary, summarise};
-use crate::eval::{EvalError, prediction, report};
-use crate::extract::{ExtractConfig, Extractor, Preset};
-use crate::image::ImageConfig;
-use crate::rerank::{RerankConfig, Reranker};
-use crate::types::{Calibration, ModelId, ScaleSet};
+use placeformer_lab::eval::ablate::{Ablation, Base, ablate};
+use placeformer_lab::eval::calibrate::{LeaveOut, OwnPlaces};
+use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions};
+use placeformer_lab::eval::features::{Describe, FeatureCache, Features, GlobalKind, ModelDescriber};
+use placeformer_lab::eval::report::{Painter, gallery};
+use placeformer_lab::eval::run::{Answer, QuerySeconds, rerank_all, search_all};
+use placeformer_lab::eval::summary::{Asked, RunConfig, Summary, summarise};
+use placeformer_lab::eval::{EvalError, prediction, report};
+use placeformer_vision::extract::{ExtractConfig, Extractor, Preset};
+use placeformer_vision::image::ImageConfig;
+use placeformer_vision::rerank::{RerankConfig, Reranker};
+use placeformer_core::types::{Calibration, ModelId, ScaleSet};
 use anyhow::{Context, bail, ensure};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
@@ -207,7 +207,7 @@ struct CacheArgs {
 
 /// Runs it.
 pub fn run(args: EvalArgs) -> anyhow::Result<()> {
-    crate::kernels::self_check()?;
+    placeformer_kernels::self_check()?;
     match args.action {
         Some(Action::Calibrate(args)) => calibrate::run(*args),
         None => run_measure(args.measure),
@@ -300,7 +300,7 @@ impl CacheArgs {
     fn folder(&self) -> anyhow::Result<PathBuf> {
         match &self.cache {
             Some(folder) => Ok(folder.clone()),
-            None => Ok(crate::extract::pull::cache_dir()?.join("eval")),
+            None => Ok(placeformer_models::cache_dir()?.join("eval")),
         }
     }
 }

@@ -2,7 +2,7 @@
 //! request.
 
 use super::sink::{Outcome, Sent, Sink, UNREACHABLE, Upload};
-use crate::types::MapName;
+use placeformer_core::types::MapName;
 use anyhow::{Context, bail};
 use rand::RngExt;
 use reqwest::StatusCode;
@@ -156,7 +156,7 @@ impl Sink for HttpSink {
             let value = match self.patiently(page).0 {
                 Attempt::Answered(value, _) => value,
                 Attempt::Refused { code, .. }
-                    if code == crate::error::ErrorCode::MapNotFound.as_str() =>
+                    if code == placeformer_core::error::ErrorCode::MapNotFound.as_str() =>
                 {
                     break;
                 }
@@ -240,7 +240,7 @@ fn parameters(upload: &Upload) -> Vec<(&'static str, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::{GeoPoint, ReferenceFields};
+    use placeformer_core::types::{GeoPoint, ReferenceFields};
     use std::io::{BufRead, BufReader, Read, Write};
     use std::net::TcpListener;
     use std::sync::mpsc;

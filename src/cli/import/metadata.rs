@@ -3,9 +3,9 @@
 //!
 //! Each field is taken from the first source that has it.
 
-use crate::eval::datasets::{UtmName, UtmZone};
-use crate::image::read_exif;
-use crate::types::{ExternalId, GeoPoint, Heading, ReferenceFields};
+use placeformer_lab::datasets::{UtmName, UtmZone};
+use placeformer_vision::image::read_exif;
+use placeformer_core::types::{ExternalId, GeoPoint, Heading, ReferenceFields};
 use anyhow::{Context, anyhow, bail, ensure};
 use std::collections::{HashMap, HashSet};
 use std::path::Path;

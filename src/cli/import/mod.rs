@@ -13,8 +13,8 @@ mod verdict;
 
 use crate::cli::output::say;
 use crate::config::ModelOverrides;
-use crate::eval::datasets::{UtmZone, list_images};
-use crate::types::{ContentHash, ExternalId, MapName};
+use placeformer_lab::datasets::{UtmZone, list_images};
+use placeformer_core::types::{ContentHash, ExternalId, MapName};
 use anyhow::{Context, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use metadata::Metadata;

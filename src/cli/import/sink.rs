@@ -1,7 +1,7 @@
 //! Where an import puts its photos.
 
-use crate::error::ErrorCode;
-use crate::types::{MapName, ReferenceFields};
+use placeformer_core::error::ErrorCode;
+use placeformer_core::types::{MapName, ReferenceFields};
 use bytes::Bytes;
 use std::collections::HashMap;
 

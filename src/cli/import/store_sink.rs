@@ -2,12 +2,12 @@
 
 use super::sink::{Outcome, Sent, Sink, Upload};
 use crate::config::{Config, ModelOverrides, Overrides};
-use crate::error::ErrorCode;
-use crate::extract::Extractor;
+use placeformer_core::error::ErrorCode;
+use placeformer_vision::extract::Extractor;
 use crate::ops::{Health, Metrics};
 use crate::pipeline::{IngestRequest, Parts, PipelineError, Service};
-use crate::store::SqliteStore;
-use crate::types::{MapName, ReferenceId};
+use placeformer_store::SqliteStore;
+use placeformer_core::types::{MapName, ReferenceId};
 use anyhow::Context;
 use std::collections::HashMap;
 use std::path::Path;
@@ -37,7 +37,7 @@ impl StoreSink {
             ..Default::default()
         };
         let config = Config::load(config, &overrides)?;
-        crate::kernels::self_check()?;
+        placeformer_kernels::self_check()?;
         let extractor = Extractor::open(&config.extract).context("cannot load the model")?;
         let store = SqliteStore::open(data, &config.store)?;
         let service = Service::start(Parts {
@@ -59,7 +59,7 @@ impl StoreSink {
         &self,
         map: &MapName,
         after: Option<ReferenceId>,
-    ) -> Result<crate::store::Page, PipelineError> {
+    ) -> Result<placeformer_store::Page, PipelineError> {
         self.runtime
             .block_on(self.service.references(Some(map.clone()), after, PAGE))
     }

@@ -9,7 +9,7 @@ mod client;
 mod report;
 
 use crate::cli::output::say;
-use crate::eval::datasets::list_images;
+use placeformer_lab::datasets::list_images;
 use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
 use client::{Outcome, Target};

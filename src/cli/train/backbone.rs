@@ -3,10 +3,10 @@
 use super::head::{Source, fit};
 use super::{RunArgs, bar, facts, finish, notes, show};
 use crate::cli::output::say;
-use crate::extract::pull::resolve_weights;
-use crate::extract::{Aggregate, ExtractConfig, Extractor, Head, HeadChoice, VitWeights};
-use crate::image::ImageConfig;
-use crate::train::{
+use placeformer_models::resolve_weights;
+use placeformer_vision::extract::{Aggregate, ExtractConfig, Extractor, Head, HeadChoice, VitWeights};
+use placeformer_vision::image::ImageConfig;
+use placeformer_lab::train::{
     Augmentation, BackboneModel, Progress, Session, TrainError, TrainableBlocks, TripletSet,
 };
 use anyhow::ensure;
@@ -16,7 +16,7 @@ pub(super) fn train(
     blocks: TrainableBlocks,
     augmentation: Augmentation,
 ) -> anyhow::Result<()> {
-    crate::kernels::self_check()?;
+    placeformer_kernels::self_check()?;
     let config = args.config(augmentation)?;
     let sides = args.data.load(args.method.seed)?;
     eprintln!("{}", sides.description);

@@ -1,8 +1,8 @@
 //! What is learnt from and what is held out, from the flags.
 
 use crate::cli::data_args::ReadArgs;
-use crate::eval::datasets::{self, Dataset, DatasetKind, DatasetOptions, Split, list_images};
-use crate::train::{Holdout, TripletSet};
+use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions, Split, list_images};
+use placeformer_lab::train::{Holdout, TripletSet};
 use anyhow::{Context, bail, ensure};
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};

@@ -1,8 +1,8 @@
 //! Training the head alone, on pooled tokens.
 
 use super::{HeadTrainArgs, RunArgs, bar, facts, finish, notes, show};
-use crate::extract::{Covariance, Extractor, Head, HeadChoice, half_whitened_head_of_few};
-use crate::train::{
+use placeformer_vision::extract::{Covariance, Extractor, Head, HeadChoice, half_whitened_head_of_few};
+use placeformer_lab::train::{
     Augmentation, HeadModel, PooledCache, PooledTokens, Progress, Session, Side, TripletSet,
 };
 use anyhow::Context;
@@ -15,7 +15,7 @@ pub(in crate::cli) fn train_head(args: HeadTrainArgs) -> anyhow::Result<()> {
 }
 
 pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
-    crate::kernels::self_check()?;
+    placeformer_kernels::self_check()?;
     let config = args.config(Augmentation::NONE)?;
     let sides = args.data.load(args.method.seed)?;
     eprintln!("{}", sides.description);

@@ -10,7 +10,7 @@ mod head;
 
 use super::model_args::ModelOptions;
 use crate::cli::output::say;
-use crate::train::{
+use placeformer_lab::train::{
     Augmentation, Outcome, Progress, Schedule, TrainConfig, TrainableBlocks, read_log, report,
 };
 use anyhow::{Context, ensure};
@@ -220,7 +220,7 @@ impl RunArgs {
     fn cache_folder(&self) -> anyhow::Result<PathBuf> {
         match &self.cache {
             Some(folder) => Ok(folder.clone()),
-            None => Ok(crate::extract::pull::cache_dir()?.join("pooled")),
+            None => Ok(placeformer_models::cache_dir()?.join("pooled")),
         }
     }
 }
@@ -271,7 +271,7 @@ fn notes(
     data: &str,
     outcome: &Outcome,
 ) -> BTreeMap<String, String> {
-    let recall = |recall: &crate::train::ValidationRecall| {
+    let recall = |recall: &placeformer_lab::train::ValidationRecall| {
         format!(
             "R@1 {:.1}, R@5 {:.1}, R@10 {:.1}",
             recall.at_1, recall.at_5, recall.at_10

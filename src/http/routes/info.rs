@@ -3,7 +3,7 @@
 use super::match_images::SizeBody;
 use crate::http::AppState;
 use crate::http::problem::ApiError;
-use crate::types::Calibration;
+use placeformer_core::types::Calibration;
 use axum::Json;
 use axum::extract::State;
 use serde::Serialize;

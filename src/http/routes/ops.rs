@@ -1,6 +1,6 @@
 //! `/livez`, `/readyz`, `/metrics`: for supervisors, balancers and Prometheus.
 
-use crate::error::ErrorCode;
+use placeformer_core::error::ErrorCode;
 use crate::http::AppState;
 use crate::http::body::read_query;
 use crate::http::problem::{ApiError, OwnBody};

@@ -2,7 +2,7 @@
 
 use crate::http::problem::ApiError;
 use crate::pipeline::Timings;
-use crate::types::{GeoPoint, Heading, Reference};
+use placeformer_core::types::{GeoPoint, Heading, Reference};
 use axum::Json;
 use axum::http::{HeaderName, HeaderValue};
 use axum::response::{IntoResponse, Response};

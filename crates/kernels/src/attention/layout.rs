@@ -1,0 +1,290 @@
+//! How the queries, keys and values of an image lie in memory, and how finished projections get
+//! there.
+//!
+//! Keys and values lie as the two products read them, cut into chunks of
+//! [`chunk_rows`](super::chunk_rows) tokens so that each chunk can be written by the thread that
+//! computed it: keys `[chunk][head][key panel][words of head_dim][columns]`, values
+//! `[chunk][head][value panel][words of chunk_rows][columns]`, panels `columns` wide as in
+//! [`Tiling`].
+//!
+//! In int8 a query and a key have one factor for all dimensions of their head. A panel of keys ends
+//! in a row of factors and one of the offsets that the queries' 128 adds to sums; a chunk's queries
+//! end in their factors, `[head][chunk_rows]`.
+
+use crate::Simd;
+use crate::gemm::{Panel, Tiling, multiply_panel};
+use crate::operand::{Format, Left, OperandBuffer, Rows, quantise_into};
+use crate::transpose::transpose;
+
+/// How the tokens of an image and their heads are laid out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct AttentionShape {
+    /// Format of queries and keys.
+    pub scores: Format,
+    /// Format of weights and values: f32 or bf16.
+    pub mix: Format,
+    /// Tokens of an image, CLS included.
+    pub tokens: usize,
+    /// Heads.
+    pub heads: usize,
+    /// Width of a head; a multiple of [`Tiling::columns`].
+    pub head_dim: usize,
+    /// Tokens of a chunk.
+    pub chunk_rows: usize,
+}
+
+impl AttentionShape {
+    /// Chunks of an image, the last possibly not full.
+    pub fn chunks(&self) -> usize {
+        self.tokens.div_ceil(self.chunk_rows)
+    }
+
+    /// Words of one chunk's keys: all heads.
+    pub fn keys_len(&self) -> usize {
+        self.heads * self.head_keys()
+    }
+
+    /// Words of one chunk's values: all heads.
+    pub fn values_len(&self) -> usize {
+        self.heads * self.head_values()
+    }
+
+    /// Words of one token's queries: all heads.
+    pub fn query_len(&self) -> usize {
+        self.heads * self.head_words()
+    }
+
+    /// Words of one chunk's queries and what their codes are worth.
+    pub fn queries_len(&self) -> usize {
+        self.chunk_rows
+            * (self.query_len()
+                + if self.scores == Format::Int8 {
+                    self.heads
+                } else {
+                    0
+                })
+    }
+
+    /// Where in a chunk's queries (`[chunk_rows, query_len]`) a block of their projection begins.
+    pub fn query_at(&self, place: Place) -> usize {
+        place.token * self.query_len()
+            + place.head * self.head_words()
+            + self.scores.words(place.dim)
+    }
+
+    /// Where in a chunk's queries the factor of a token's begins, if they have one.
+    pub(super) fn query_factor_at(&self, head: usize, token: usize) -> usize {
+        self.chunk_rows * (self.query_len() + head) + token
+    }
+
+    pub(super) fn head_words(&self) -> usize {
+        self.scores.words(self.head_dim)
+    }
+
+    /// Words of a panel of keys for each of its columns.
+    pub(super) fn panel_rows(&self) -> usize {
+        self.head_words() + if self.scores == Format::Int8 { 2 } else { 0 }
+    }
+
+    pub(super) fn head_keys(&self) -> usize {
+        self.panel_rows() * self.chunk_rows
+    }
+
+    pub(super) fn head_values(&self) -> usize {
+        self.mix.words(self.chunk_rows) * self.head_dim
+    }
+
+    pub(super) fn padded_tokens(&self) -> usize {
+        self.chunks() * self.chunk_rows
+    }
+}
+
+/// Where a finished block of a projection belongs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Place {
+    /// The head.
+    pub head: usize,
+    /// Its dimension that the block's first column is.
+    pub dim: usize,
+    /// The token of the chunk that the block's first row is; whole panels of keys.
+    pub token: usize,
+}
+
+/// Writes finished rows of the key projection, in f32 or bf16, to their places in a chunk's keys.
+///
+/// # Panics
+/// If `keys` is not a chunk of `shape`, or the place not the first of a panel.
+pub fn store_keys(
+    simd: Simd,
+    shape: &AttentionShape,
+    place: Place,
+    block: Rows<'_>,
+    keys: &mut [u32],
+) {
+    let first = shape.scores.words(place.dim) * Tiling::of(simd).columns;
+    for (rows, panel) in key_panels(simd, shape, place, block, keys) {
+        let size = (rows.len() / block.stride, block.stride);
+        transpose(
+            simd,
+            (rows, block.stride),
+            size,
+            &mut panel[first..],
+            Tiling::of(simd).columns,
+        );
+    }
+}
+
+/// The rows of `block` by the panel of keys they belong into.
+fn key_panels<'a>(
+    simd: Simd,
+    shape: &AttentionShape,
+    place: Place,
+    block: Rows<'a>,
+    keys: &'a mut [u32],
+) -> impl Iterator<Item = (&'a [u32], &'a mut [u32])> {
+    let columns = Tiling::of(simd).columns;
+    assert_eq!(keys.len(), shape.keys_len(), "not one chunk of keys");
+    assert_eq!(place.token % columns, 0, "keys are written by whole panels");
+    let head = &mut keys[place.head * shape.head_keys()..][..shape.head_keys()];
+    let panels = head
+        .chunks_exact_mut(shape.panel_rows() * columns)
+        .skip(place.token / columns);
+    block.data.chunks(columns * block.stride).zip(panels)
+}
+
+/// Writes the queries of a head, rows `[n, head_dim]` of f32 whose first is the place's token, as
+/// codes to their places in a chunk's queries.
+///
+/// # Panics
+/// If `queries` is not a chunk of `shape`, or the scores are not int8.
+pub fn store_query_codes(
+    simd: Simd,
+    shape: &AttentionShape,
+    place: Place,
+    rows: &[f32],
+    queries: &mut [u32],
+) {
+    assert_eq!(
+        (shape.scores, queries.len()),
+        (Format::Int8, shape.queries_len()),
+        "not one chunk of codes"
+    );
+    let (codes, factors) = queries.split_at_mut(shape.chunk_rows * shape.query_len());
+    let factors = &mut factors[shape.query_factor_at(place.head, place.token) - codes.len()..];
+    let factors = bytemuck::cast_slice_mut(&mut factors[..rows.len() / shape.head_dim]);
+    let codes = (
+        &mut codes[shape.query_at(Place { dim: 0, ..place })..],
+        shape.query_len(),
+    );
+    quantise_into(simd, shape.head_dim, (rows, shape.head_dim), codes, factors);
+}
+
+/// As [`store_query_codes`], to a chunk's keys; `buffer` is room to work in.
+///
+/// # Panics
+/// As [`store_keys`], or if the scores are not int8.
+pub fn store_key_codes(
+    simd: Simd,
+    shape: &AttentionShape,
+    place: Place,
+    rows: &[f32],
+    buffer: &mut OperandBuffer,
+    keys: &mut [u32],
+) {
+    assert_eq!(shape.scores, Format::Int8, "keys are not codes");
+    let (columns, words, width) = (Tiling::of(simd).columns, shape.head_words(), shape.head_dim);
+    let packed = buffer.pack(simd, Format::Int8, rows.len() / width, width, (rows, width));
+    let factors = packed.factors.chunks(columns);
+    for ((rows, panel), factors) in key_panels(simd, shape, place, packed.rows, keys).zip(factors) {
+        let (codes, tail) = panel.split_at_mut(words * columns);
+        transpose(simd, (rows, words), (factors.len(), words), codes, columns);
+        // From unsigned around 128 to signed.
+        codes.iter_mut().for_each(|word| *word ^= ZERO_CODES);
+        let (of_columns, offsets) = tail.split_at_mut(columns);
+        of_columns[..factors.len()].copy_from_slice(bytemuck::cast_slice(factors));
+        store_offsets(simd, Panel::whole(codes, words), offsets);
+    }
+}
+
+/// Four codes on the left that stand for zero.
+const ZERO_CODES: u32 = 0x8080_8080;
+
+/// A query of zeros, as wide as the tokens of any backbone.
+static ZERO_QUERY: [u32; 512] = [ZERO_CODES; 512];
+
+/// What a query of zeros gives, which is what every query's sums are too high by.
+fn store_offsets(simd: Simd, panel: Panel<'_>, offsets: &mut [u32]) {
+    let tile = Tiling::of(simd);
+    let mut sums = [0.0; 16 * 32];
+    let sums = &mut sums[..tile.row_step * tile.columns];
+    multiply_panel(
+        simd,
+        Format::Int8,
+        tile.row_step,
+        Rows {
+            data: &ZERO_QUERY,
+            stride: 0,
+        },
+        panel,
+        sums,
+        tile.columns,
+    );
+    offsets.copy_from_slice(bytemuck::cast_slice(&sums[..tile.columns]));
+}
+
+/// As [`store_keys`], for values: their words hold the same dimension of neighbouring tokens.
+///
+/// # Panics
+/// If `values` is not a chunk of `shape`.
+pub fn store_values(
+    simd: Simd,
+    shape: &AttentionShape,
+    place: Place,
+    block: Rows<'_>,
+    values: &mut [u32],
+) {
+    let columns = Tiling::of(simd).columns;
+    assert_eq!(values.len(), shape.values_len(), "not one chunk of values");
+    let words = |tokens: usize| shape.mix.words(tokens);
+    let row = place.dim / columns * words(shape.chunk_rows) + words(place.token);
+    let panel = &mut values[place.head * shape.head_values() + row * columns..];
+    if shape.mix == Format::F32 {
+        return panel[..block.data.len()].copy_from_slice(block.data);
+    }
+    for (pair, out) in block
+        .data
+        .chunks_exact(2 * block.stride)
+        .zip(panel.chunks_exact_mut(columns))
+    {
+        let (first, second) = pair.split_at(block.stride);
+        for ((out, first), second) in out.chunks_exact_mut(2).zip(first).zip(second) {
+            out[0] = first & 0xffff | second << 16;
+            out[1] = first >> 16 | second & 0xffff_0000;
+        }
+    }
+}
+
+/// The query rows of one head from row `first` of a chunk's queries on.
+pub(super) fn head_queries<'a>(
+    shape: &AttentionShape,
+    head: usize,
+    first: usize,
+    queries: &'a [u32],
+) -> Left<'a> {
+    let at = shape.query_at(Place {
+        head,
+        dim: 0,
+        token: first,
+    });
+    let factors = match shape.scores {
+        Format::Int8 => bytemuck::cast_slice(&queries[shape.query_factor_at(head, first)..]),
+        _ => &[],
+    };
+    Left {
+        rows: Rows {
+            data: &queries[at..],
+            stride: shape.query_len(),
+        },
+        factors,
+    }
+}

@@ -1,0 +1,435 @@
+//! The two pictures, laid out in panels.
+
+use super::DrawError;
+use super::canvas::{Canvas, Panel, Rgba};
+use placeformer_vision::image::RgbImage;
+use placeformer_core::types::{ImageSize, PackedPatches, SCALES, ScaleSet};
+
+/// Height of every panel in pixels.
+const PANEL_HEIGHT: u32 = 360;
+/// Widest panel; a panorama is squashed to it.
+const PANEL_MAX_WIDTH: u32 = 960;
+/// Space between panels and around a row.
+const GAP: u32 = 8;
+/// Height of the label above a row of lines.
+const CAPTION: u32 = 24;
+const BACKGROUND: [u8; 3] = [20, 22, 27];
+/// Scales 1, 2, 3: told apart by hue, by lightness and by size.
+const SCALE_COLOURS: [Rgba; SCALES] = [
+    [86, 214, 255, 235],
+    [255, 196, 61, 240],
+    [255, 98, 190, 245],
+];
+/// One colour per combination, repeated beyond five.
+const LINE_COLOURS: [Rgba; 5] = [
+    [94, 231, 138, 255],
+    [255, 179, 71, 255],
+    [122, 183, 255, 255],
+    [255, 122, 158, 255],
+    [214, 173, 255, 255],
+];
+
+/// The attention of one image: one value per patch of the grid, any positive unit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AttentionMap<'a> {
+    /// `[rows, columns]` row-major.
+    pub values: &'a [f32],
+    /// Patches per row.
+    pub columns: usize,
+    /// Rows of patches.
+    pub rows: usize,
+}
+
+/// One of the two images of a match.
+#[derive(Debug, Clone, Copy)]
+pub struct MatchSide<'a> {
+    /// The photo, of any size.
+    pub image: &'a RgbImage,
+    /// Its attention, where it is at hand.
+    pub attention: Option<AttentionMap<'a>>,
+    /// Its key patches.
+    pub patches: &'a PackedPatches,
+}
+
+/// What one scale combination found.
+#[derive(Debug, Clone, Copy)]
+pub struct CombinationLines<'a> {
+    /// Which scales were matched jointly.
+    pub scales: ScaleSet,
+    /// How many mutual nearest neighbours there were.
+    pub matches: usize,
+    /// Rows of the inliers in the query's and the reference's key patches.
+    pub inliers: &'a [(u32, u32)],
+}
+
+/// Both images side by side: a row with attention and key patches (scale 1 blue, 2 amber, 3 pink),
+/// then a row of inlier lines per combination, labelled `s12 inliers/matches`.
+///
+/// # Errors
+/// An image without pixels, an attention map that does not fill its grid, or an inlier that names
+/// no patch.
+pub fn match_picture(
+    query: &MatchSide,
+    reference: &MatchSide,
+    combinations: &[CombinationLines],
+) -> Result<RgbImage, DrawError> {
+    let widths = [panel_width(query.image)?, panel_width(reference.image)?];
+    let line_row = CAPTION + PANEL_HEIGHT + GAP;
+    let size = ImageSize {
+        width: widths[0] + widths[1] + 3 * GAP,
+        height: GAP + PANEL_HEIGHT + GAP + line_row * combinations.len() as u32,
+    };
+    let mut canvas = Canvas::new(size, BACKGROUND)?;
+    let panels = |top: u32| {
+        let panel = |left, width| Panel {
+            left,
+            top,
+            size: ImageSize {
+                width,
+                height: PANEL_HEIGHT,
+            },
+        };
+        [panel(GAP, widths[0]), panel(2 * GAP + widths[0], widths[1])]
+    };
+    let sides = [query, reference];
+    let top = panels(GAP);
+    let small = [
+        query.image.resized(top[0].size)?,
+        reference.image.resized(top[1].size)?,
+    ];
+    for ((side, panel), small) in sides.into_iter().zip(top).zip(&small) {
+        match side.attention {
+            Some(attention) => canvas.place(&heated(small, attention)?, panel),
+            None => canvas.place(small, panel),
+        }
+        draw_patches(&mut canvas, side.patches, panel);
+    }
+    for (row, combination) in combinations.iter().enumerate() {
+        let caption_top = GAP + PANEL_HEIGHT + GAP + row as u32 * line_row;
+        let colour = LINE_COLOURS[row % LINE_COLOURS.len()];
+        let text = format!(
+            "{} {}/{}",
+            combination.scales.score_name(),
+            combination.inliers.len(),
+            combination.matches
+        );
+        canvas.label(&text, GAP as f32, caption_top as f32 + 4.0, 2.0, colour);
+        let row_panels = panels(caption_top + CAPTION);
+        small
+            .iter()
+            .zip(row_panels)
+            .for_each(|(small, panel)| canvas.place(small, panel));
+        draw_lines(
+            &mut canvas,
+            [query.patches, reference.patches],
+            row_panels,
+            combination.inliers,
+            colour,
+        )?;
+    }
+    Ok(canvas.finish())
+}
+
+/// `image` at its own size under its attention as heat.
+///
+/// # Errors
+/// An image without pixels, or an attention map that does not fill its grid.
+pub fn attention_picture(image: &RgbImage, attention: AttentionMap) -> Result<RgbImage, DrawError> {
+    if image.pixels.is_empty() {
+        return Err(DrawError::Size(image.size));
+    }
+    heated(image, attention)
+}
+
+fn panel_width(image: &RgbImage) -> Result<u32, DrawError> {
+    let ImageSize { width, height } = image.size;
+    if width == 0 || height == 0 {
+        return Err(DrawError::Size(image.size));
+    }
+    let width = u64::from(width) * u64::from(PANEL_HEIGHT) / u64::from(height);
+    // Clamped to a three-digit number.
+    Ok(width.clamp(16, u64::from(PANEL_MAX_WIDTH)) as u32)
+}
+
+/// Where a point in model input pixels lies on the canvas.
+fn on_canvas(patches: &PackedPatches, row: usize, panel: Panel) -> [f32; 2] {
+    let [x, y] = patches.centre(row);
+    let [across, down] = pixels_per_input_pixel(patches, panel);
+    [panel.left as f32 + x * across, panel.top as f32 + y * down]
+}
+
+fn pixels_per_input_pixel(patches: &PackedPatches, panel: Panel) -> [f32; 2] {
+    let input = |count: u16| f32::from(count) * f32::from(patches.grid.patch_px);
+    [
+        panel.size.width as f32 / input(patches.grid.columns),
+        panel.size.height as f32 / input(patches.grid.rows),
+    ]
+}
+
+fn draw_patches(canvas: &mut Canvas, patches: &PackedPatches, panel: Panel) {
+    let [across, down] = pixels_per_input_pixel(patches, panel);
+    for scale in 1..=SCALES {
+        // A little smaller than the patch itself, so that neighbours stay apart.
+        let side = f32::from(patches.grid.patch_px) * scale as f32 * across.min(down) - 3.0;
+        for row in patches.rows(scale) {
+            canvas.square(
+                on_canvas(patches, row, panel),
+                side.max(2.0),
+                SCALE_COLOURS[scale - 1],
+                scale as f32 * 0.6 + 0.4,
+            );
+        }
+    }
+}
+
+fn draw_lines(
+    canvas: &mut Canvas,
+    patches: [&PackedPatches; 2],
+    panels: [Panel; 2],
+    inliers: &[(u32, u32)],
+    colour: Rgba,
+) -> Result<(), DrawError> {
+    let end = |side: usize, row: u32| {
+        if row as usize >= patches[side].len() {
+            return Err(DrawError::NoSuchPatch {
+                row,
+                patches: patches[side].len(),
+            });
+        }
+        Ok(on_canvas(patches[side], row as usize, panels[side]))
+    };
+    let ends = inliers
+        .iter()
+        .map(|&(query, reference)| Ok((end(0, query)?, end(1, reference)?)));
+    let ends = ends.collect::<Result<Vec<_>, DrawError>>()?;
+    // Many lines thin out, so that the pictures beneath stay visible.
+    let opacity = if ends.len() > 60 { 120 } else { 200 };
+    for &(from, to) in &ends {
+        canvas.line(from, to, [0, 0, 0, opacity / 2], 2.6);
+        canvas.line(from, to, [colour[0], colour[1], colour[2], opacity], 1.2);
+    }
+    for point in ends.into_iter().flat_map(|(from, to)| [from, to]) {
+        canvas.dot(point, 3.6, [0, 0, 0, 200]);
+        canvas.dot(point, 2.6, colour);
+    }
+    Ok(())
+}
+
+/// `image` darkened where attention is low and coloured where it is high, smoothly between patch
+/// centres.
+fn heated(image: &RgbImage, attention: AttentionMap) -> Result<RgbImage, DrawError> {
+    let AttentionMap {
+        values,
+        columns,
+        rows,
+    } = attention;
+    if values.is_empty() || values.len() != columns * rows {
+        return Err(DrawError::AttentionShape {
+            values: values.len(),
+            columns,
+            rows,
+        });
+    }
+    // A few patches (often sky or lens artefacts) tower above the rest: the 98th percentile is
+    // already full heat.
+    let mut sorted: Vec<f32> = values
+        .iter()
+        .copied()
+        .filter(|value| value.is_finite())
+        .collect();
+    sorted.sort_by(f32::total_cmp);
+    let peak = sorted
+        .get((sorted.len() * 98).div_ceil(100).saturating_sub(1))
+        .copied()
+        .unwrap_or(0.0)
+        .max(f32::MIN_POSITIVE);
+    let (width, height) = (image.size.width as usize, image.size.height as usize);
+    let mut pixels = Vec::with_capacity(image.pixels.len());
+    for (at, rgb) in image.pixels.chunks_exact(3).enumerate() {
+        let x = ((at % width) as f32 + 0.5) / width as f32 * columns as f32 - 0.5;
+        let y = ((at / width) as f32 + 0.5) / height as f32 * rows as f32 - 0.5;
+        let heat = (interpolate(attention, x, y) / peak).clamp(0.0, 1.0).sqrt();
+        let colour = heat_colour(heat);
+        let share = 0.25 + 0.4 * heat;
+        pixels
+            .extend((0..3).map(|c| (f32::from(rgb[c]) * (1.0 - share) + colour[c] * share) as u8));
+    }
+    Ok(RgbImage {
+        size: image.size,
+        pixels,
+    })
+}
+
+/// The map between patch centres, at `x`, `y` in patches.
+fn interpolate(attention: AttentionMap, x: f32, y: f32) -> f32 {
+    let (left, top) = (x.floor(), y.floor());
+    let at = |column: f32, row: f32| {
+        let column = column.clamp(0.0, (attention.columns - 1) as f32) as usize;
+        let row = row.clamp(0.0, (attention.rows - 1) as f32) as usize;
+        attention.values[row * attention.columns + column]
+    };
+    let (fx, fy) = (x - left, y - top);
+    let upper = at(left, top) * (1.0 - fx) + at(left + 1.0, top) * fx;
+    let lower = at(left, top + 1.0) * (1.0 - fx) + at(left + 1.0, top + 1.0) * fx;
+    upper * (1.0 - fy) + lower * fy
+}
+
+/// Black through violet, red and orange to pale yellow: lightness rises all the way, so it also
+/// reads in grey.
+fn heat_colour(heat: f32) -> [f32; 3] {
+    const STOPS: [[f32; 3]; 5] = [
+        [4.0, 4.0, 20.0],
+        [87.0, 16.0, 110.0],
+        [188.0, 55.0, 84.0],
+        [249.0, 142.0, 9.0],
+        [252.0, 255.0, 164.0],
+    ];
+    let position = heat * (STOPS.len() - 1) as f32;
+    let stop = (position as usize).min(STOPS.len() - 2);
+    let along = position - stop as f32;
+    std::array::from_fn(|c| STOPS[stop][c] * (1.0 - along) + STOPS[stop + 1][c] * along)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use placeformer_core::types::{PatchGrid, PoolingStride};
+    use half::f16;
+
+    fn patches(index: Vec<u16>, counts: [usize; 3]) -> PackedPatches {
+        let n = index.len();
+        let grid = PatchGrid {
+            columns: 32,
+            rows: 24,
+            patch_px: 14,
+            stride: PoolingStride::Kernel,
+        };
+        let (attention, factor, codes) = (vec![f16::ONE; n], vec![1.0; n], vec![1; n]);
+        PackedPatches {
+            grid,
+            dim: 1,
+            counts,
+            index,
+            attention,
+            factor,
+            codes,
+        }
+    }
+
+    fn grey() -> RgbImage {
+        RgbImage::filled(
+            ImageSize {
+                width: 640,
+                height: 480,
+            },
+            [60, 60, 60],
+        )
+    }
+
+    #[test]
+    fn rows_and_panels_add_up_and_lines_join_the_patches() {
+        let (image, patches) = (grey(), patches(vec![32 * 12 + 16, 0], [1, 1, 0]));
+        let side = MatchSide {
+            image: &image,
+            attention: None,
+            patches: &patches,
+        };
+        let scales: ScaleSet = "1+2".parse().unwrap();
+        let lines = CombinationLines {
+            scales,
+            matches: 9,
+            inliers: &[(0, 0)],
+        };
+        let picture = match_picture(&side, &side, &[lines, lines]).unwrap();
+        assert_eq!(
+            picture.size,
+            ImageSize {
+                width: 480 * 2 + 24,
+                height: 8 + 360 + 8 + 2 * 392
+            }
+        );
+        // The patch lies at 231, 175 of 448 x 336, so at 247.5, 187.5 of a panel of 480 x 360.
+        let top = 8 + 360 + 8 + 24;
+        let (left_x, right_x, y) = (8 + 247, 16 + 480 + 247, top + 187);
+        assert_eq!(picture.pixel(left_x, y), [94, 231, 138]);
+        assert_eq!(picture.pixel(right_x, y), [94, 231, 138]);
+        let between = picture.pixel((left_x + right_x) / 2, y);
+        assert!(between[1] > 150 && between[0] < between[1], "{between:?}");
+        assert_eq!(picture.pixel(left_x, y + 40), [60, 60, 60]);
+        assert_eq!(picture.pixel(left_x, y + 392), [255, 179, 71]);
+    }
+
+    #[test]
+    fn key_patches_are_outlined_in_the_colour_of_their_scale() {
+        let (image, patches) = (grey(), patches(vec![0, 15], [0, 1, 1]));
+        let side = MatchSide {
+            image: &image,
+            attention: None,
+            patches: &patches,
+        };
+        let picture = match_picture(&side, &side, &[]).unwrap();
+        // The first 2x2 window spans 30 x 30 pixels of the panel at 8, 8; its outline is inset by
+        // 1.5.
+        let edge = picture.pixel(8 + 15, 8 + 1);
+        assert!(edge[0] > 150 && edge[2] < 120, "{edge:?}");
+        assert_eq!(picture.pixel(8 + 15, 8 + 15), [60, 60, 60]);
+    }
+
+    #[test]
+    fn heat_is_where_the_attention_is() {
+        let mut values = vec![0.1; 12];
+        values[5] = 5.0;
+        let picture = attention_picture(
+            &grey(),
+            AttentionMap {
+                values: &values,
+                columns: 4,
+                rows: 3,
+            },
+        )
+        .unwrap();
+        let (hot, cold) = (picture.pixel(240, 240), picture.pixel(600, 440));
+        assert!(hot[0] > cold[0] + 60, "{hot:?} {cold:?}");
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused() {
+        let (image, patches) = (grey(), patches(vec![0], [1, 0, 0]));
+        let map = AttentionMap {
+            values: &[1.0; 5],
+            columns: 2,
+            rows: 3,
+        };
+        assert!(matches!(
+            attention_picture(&image, map),
+            Err(DrawError::AttentionShape { values: 5, .. })
+        ));
+        let side = MatchSide {
+            image: &image,
+            attention: None,
+            patches: &patches,
+        };
+        let lines = CombinationLines {
+            scales: "1".parse().unwrap(),
+            matches: 1,
+            inliers: &[(0, 1)],
+        };
+        let error = match_picture(&side, &side, &[lines]).unwrap_err();
+        assert_eq!(error, DrawError::NoSuchPatch { row: 1, patches: 1 });
+        let empty = RgbImage {
+            size: ImageSize {
+                width: 0,
+                height: 3,
+            },
+            pixels: vec![],
+        };
+        let side = MatchSide {
+            image: &empty,
+            ..side
+        };
+        assert!(matches!(
+            match_picture(&side, &side, &[]),
+            Err(DrawError::Size(_))
+        ));
+    }
+}

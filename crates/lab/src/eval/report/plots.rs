@@ -1,0 +1,219 @@
+//! The plots of an evaluation: recall over k, precision over recall, S of right and wrong answers,
+//! reliability.
+
+use super::html::escape;
+use super::svg::{Histogram, LineChart, Series};
+use crate::datasets::{Dataset, Truth};
+use crate::eval::measure::{Rejection, ReliabilityBin, first_hit, recall_at};
+use crate::eval::run::Answer;
+use crate::eval::summary::Summary;
+
+/// Longest list of answers the recall plot looks at.
+const RECALL_TO: usize = 25;
+
+/// All plots that the data allow, as figures.
+pub fn plots(
+    summary: &Summary,
+    dataset: &Dataset,
+    answers: &[Answer],
+    left_out: &[Answer],
+) -> String {
+    let mut figures = Vec::new();
+    if summary.queries_with_match > 0 {
+        figures.push((
+            recall_plot(summary, dataset, answers),
+            "Share of queries with a right place among the first k.",
+        ));
+        figures.push((
+            rejection_plot(summary),
+            "Accepting only answers above a score: S, or nearness before re-ranking.",
+        ));
+    }
+    if summary.recall.reranked.is_some() {
+        figures.push((
+            score_plot(dataset, answers, left_out),
+            "S of the best answer, by whether it is right.",
+        ));
+    }
+    if let Some(plot) = reliability_plot(summary) {
+        figures.push((plot, "Share of right answers by confidence, with the calibration error; the dashed line is ideal. What is fitted \
+             here is five-fold cross-validated."));
+    }
+    let figure = |(svg, caption): &(String, &str)| {
+        format!(
+            "<figure>{svg}<figcaption>{}</figcaption></figure>\n",
+            escape(caption)
+        )
+    };
+    format!(
+        "<div class=\"plots\">{}</div>\n",
+        figures.iter().map(figure).collect::<String>()
+    )
+}
+
+fn recall_plot(summary: &Summary, dataset: &Dataset, answers: &[Answer]) -> String {
+    let hits = |ranking: fn(&Answer) -> Vec<usize>| -> Vec<Option<usize>> {
+        let with_match = answers
+            .iter()
+            .filter(|answer| !dataset.truth[answer.query].positives().is_empty());
+        with_match
+            .map(|answer| first_hit(&ranking(answer), dataset.truth[answer.query].positives()))
+            .collect()
+    };
+    let line = |name: &str, class, ranking| {
+        let hits = hits(ranking);
+        let points = (1..=RECALL_TO)
+            .filter_map(|k| Some((k as f64, recall_at(&hits, k)?)))
+            .collect();
+        Series {
+            name: name.into(),
+            class,
+            points,
+            dots: false,
+        }
+    };
+    let mut series = vec![line("global", "b", Answer::global_ranking)];
+    if summary.recall.reranked.is_some() {
+        series.insert(0, line("re-ranked", "a", Answer::reranked_ranking));
+    }
+    let lowest = series
+        .iter()
+        .flat_map(|s| &s.points)
+        .map(|point| point.1)
+        .fold(100.0, f64::min);
+    LineChart {
+        title: format!("Recall at k on {}", summary.dataset),
+        x_label: "k".into(),
+        y_label: "recall, %".into(),
+        x_range: (1.0, RECALL_TO as f64),
+        // Room for the differences, but always a round lower end.
+        y_range: (
+            (lowest / 20.0).floor().max(0.0) * 20.0 - if lowest >= 100.0 { 20.0 } else { 0.0 },
+            100.0,
+        ),
+        series,
+    }
+    .render()
+}
+
+fn rejection_plot(summary: &Summary) -> String {
+    let line = |name: &str, class, rejection: &Rejection| {
+        let points = rejection
+            .curve
+            .iter()
+            .map(|point| (point.recall, point.precision))
+            .collect();
+        Series {
+            name: name.into(),
+            class,
+            points,
+            dots: false,
+        }
+    };
+    let mut series = vec![line("global", "b", &summary.rejection.global)];
+    if let Some(rejection) = &summary.rejection.reranked {
+        series.insert(0, line("re-ranked", "a", rejection));
+    }
+    LineChart {
+        title: format!("Precision over recall on {}", summary.dataset),
+        x_label: "recall, %".into(),
+        y_label: "precision, %".into(),
+        x_range: (0.0, 100.0),
+        y_range: (0.0, 100.0),
+        series,
+    }
+    .render()
+}
+
+fn score_plot(dataset: &Dataset, answers: &[Answer], left_out: &[Answer]) -> String {
+    let (mut right, mut wrong, mut none) = (Vec::new(), Vec::new(), Vec::new());
+    for answer in answers {
+        let Some(best) = answer.reranked.first() else {
+            continue;
+        };
+        let score = f64::from(best.score.spatial_score);
+        match &dataset.truth[answer.query] {
+            Truth::Positives(positives) if positives.binary_search(&best.index).is_ok() => {
+                right.push(score)
+            }
+            Truth::Positives(_) => wrong.push(score),
+            Truth::NoMatch => none.push(score),
+            Truth::Unknown => {}
+        }
+    }
+    none.extend(
+        left_out
+            .iter()
+            .filter_map(|answer| Some(f64::from(answer.reranked.first()?.score.spatial_score))),
+    );
+    let series = [
+        ("right", "a", right),
+        ("wrong", "b", wrong),
+        ("no match exists", "c", none),
+    ];
+    let series = series
+        .into_iter()
+        .filter(|(_, _, values)| !values.is_empty());
+    Histogram {
+        title: "Histogram of S".into(),
+        x_label: "S of the best answer".into(),
+        series: series
+            .map(|(name, class, values)| (name.to_owned(), class, values))
+            .collect(),
+        bins: 30,
+    }
+    .render()
+}
+
+fn reliability_plot(summary: &Summary) -> Option<String> {
+    let line = |name: String, class, bins: &[ReliabilityBin]| {
+        let points = bins
+            .iter()
+            .map(|bin| (bin.confidence, bin.accuracy))
+            .collect();
+        Series {
+            name,
+            class,
+            points,
+            dots: true,
+        }
+    };
+    let mut series = Vec::new();
+    if let Some(fitted) = &summary.calibration {
+        let name = format!(
+            "fitted here, error {:.3}",
+            fitted.expected_calibration_error
+        );
+        series.push(line(name, "a", &fitted.bins));
+    }
+    for (name, class, applied) in [
+        ("the model's own", "b", &summary.shipped_calibration),
+        ("the one given", "c", &summary.given_calibration),
+    ] {
+        if let Some(applied) = applied {
+            let name = format!("{name}, error {:.3}", applied.expected_calibration_error);
+            series.push(line(name, class, &applied.bins));
+        }
+    }
+    if series.is_empty() {
+        return None;
+    }
+    series.insert(
+        0,
+        Series {
+            name: String::new(),
+            class: "muted",
+            points: vec![(0.0, 0.0), (1.0, 1.0)],
+            dots: false,
+        },
+    );
+    let chart = LineChart {
+        title: "Reliability of confidences".into(),
+        x_label: "confidence".into(),
+        y_label: "share right".into(),
+        x_range: (0.0, 1.0),
+        y_range: (0.0, 1.0),
+        series,
+    };
+    Some(chart.render())
+}

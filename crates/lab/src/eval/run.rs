@@ -1,0 +1,243 @@
+//! Search and re-ranking of every query, as the service does them, with the time each stage takes.
+
+use super::EvalError;
+use super::features::Features;
+use placeformer_vision::rerank::{PairScore, RerankConfig, Reranked, Reranker};
+use placeformer_vision::search::{IndexEntry, MapIndex};
+use placeformer_core::types::{GLOBAL_DIM, PackedPatches, ReferenceFilter, ReferenceId};
+use indicatif::ProgressBar;
+use rayon::prelude::*;
+use serde::Serialize;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// A database image with its distance to the query.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Neighbour {
+    /// Index into the database.
+    pub index: usize,
+    /// Euclidean distance of the global vectors.
+    pub distance: f32,
+}
+
+/// A candidate after re-ranking.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Candidate {
+    /// Index into the database.
+    pub index: usize,
+    /// Euclidean distance of the global vectors.
+    pub distance: f32,
+    /// What the key patches say.
+    pub score: PairScore,
+}
+
+/// The answer to one query.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Answer {
+    /// Index into the queries.
+    pub query: usize,
+    /// By global distance, nearest first.
+    pub global: Vec<Neighbour>,
+    /// By S; empty if nothing was re-ranked.
+    pub reranked: Vec<Candidate>,
+}
+
+impl Answer {
+    /// Database indices by global distance.
+    pub fn global_ranking(&self) -> Vec<usize> {
+        self.global
+            .iter()
+            .map(|neighbour| neighbour.index)
+            .collect()
+    }
+
+    /// Database indices by S.
+    pub fn reranked_ranking(&self) -> Vec<usize> {
+        self.reranked
+            .iter()
+            .map(|candidate| candidate.index)
+            .collect()
+    }
+}
+
+/// Mean seconds per query.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct QuerySeconds {
+    /// Finding the candidates.
+    pub search: f64,
+    /// Loading their key patches.
+    pub load: f64,
+    /// Matching and verifying them.
+    pub rerank: f64,
+}
+
+/// The nearest database images of every readable query, as many as `candidates` says for it; the
+/// second value is the mean seconds per query.
+pub fn search_all(
+    database: &Features,
+    queries: &Features,
+    candidates: impl Fn(usize) -> usize,
+) -> (Vec<Answer>, f64) {
+    let searcher = Searcher::new(database);
+    let start = Instant::now();
+    let answer = |query: usize| {
+        let global = searcher.search(queries.global(query)?, candidates(query));
+        Some(Answer {
+            query,
+            global,
+            reranked: Vec::new(),
+        })
+    };
+    let answers: Vec<Answer> = (0..queries.len()).filter_map(answer).collect();
+    let seconds = start.elapsed().as_secs_f64() / answers.len().max(1) as f64;
+    (answers, seconds)
+}
+
+/// Where key patches come from: the cache as it is, or what an ablation makes of it.
+pub type LoadPatches<'a> =
+    dyn Fn(&Features, usize) -> Result<Arc<PackedPatches>, EvalError> + Sync + 'a;
+
+/// Re-ranks the candidates of every answer; the second value is the mean seconds per query (load,
+/// rerank).
+pub fn rerank_all(
+    patches: &LoadPatches<'_>,
+    database: &Features,
+    queries: &Features,
+    mut answers: Vec<Answer>,
+    config: &RerankConfig,
+    progress: &ProgressBar,
+) -> Result<(Vec<Answer>, QuerySeconds), EvalError> {
+    let reranker = Reranker::new(config.clone());
+    let mut seconds = QuerySeconds::default();
+    for answer in &mut answers {
+        let start = Instant::now();
+        let query = patches(queries, answer.query)?;
+        let load = |neighbour: &Neighbour| patches(database, neighbour.index);
+        let candidates: Vec<_> = answer
+            .global
+            .par_iter()
+            .map(load)
+            .collect::<Result<_, _>>()?;
+        seconds.load += start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let outcome = reranker.rerank(
+            &query,
+            candidates.len(),
+            |i| Ok::<_, EvalError>(candidates[i].clone()),
+            None,
+        );
+        seconds.rerank += start.elapsed().as_secs_f64();
+        match outcome {
+            Reranked::Complete { ranked, mut failed } => {
+                if let Some((_, error)) = failed.pop() {
+                    return Err(error);
+                }
+                let candidate = |ranked: placeformer_vision::rerank::Ranked| {
+                    let Neighbour { index, distance } = answer.global[ranked.candidate];
+                    Candidate {
+                        index,
+                        distance,
+                        score: ranked.score,
+                    }
+                };
+                answer.reranked = ranked.into_iter().map(candidate).collect();
+            }
+            Reranked::DeadlinePassed => {
+                return Err(EvalError::Setting(
+                    "re-ranking stopped at a deadline though none was set".into(),
+                ));
+            }
+        }
+        progress.inc(1);
+    }
+    let count = answers.len().max(1) as f64;
+    Ok((
+        answers,
+        QuerySeconds {
+            load: seconds.load / count,
+            rerank: seconds.rerank / count,
+            ..seconds
+        },
+    ))
+}
+
+/// Exact search over global vectors: the service's index at its length, else a plain scan.
+enum Searcher<'f> {
+    Index(Box<MapIndex>),
+    Scan(&'f Features),
+}
+
+impl<'f> Searcher<'f> {
+    fn new(database: &'f Features) -> Self {
+        if database.dim != GLOBAL_DIM {
+            return Self::Scan(database);
+        }
+        let entry = |index: usize| {
+            let global = database.global(index)?.to_vec();
+            Some(IndexEntry {
+                id: id_of(index),
+                global,
+                location: None,
+                captured_at: None,
+            })
+        };
+        Self::Index(Box::new(MapIndex::build(
+            (0..database.len()).filter_map(entry).collect(),
+        )))
+    }
+
+    fn search(&self, query: &[f32], k: usize) -> Vec<Neighbour> {
+        match self {
+            Self::Index(index) => {
+                let found = index.search(query, k, &ReferenceFilter::default());
+                found
+                    .into_iter()
+                    .map(|n| Neighbour {
+                        index: index_of(n.id),
+                        distance: n.distance,
+                    })
+                    .collect()
+            }
+            Self::Scan(database) => scan(database, query, k),
+        }
+    }
+}
+
+/// An identifier that sorts like the index it stands for.
+fn id_of(index: usize) -> ReferenceId {
+    ReferenceId::from_bytes((index as u128).to_be_bytes())
+}
+
+fn index_of(id: ReferenceId) -> usize {
+    u128::from_be_bytes(*id.as_bytes()) as usize
+}
+
+fn scan(database: &Features, query: &[f32], k: usize) -> Vec<Neighbour> {
+    let distance = |index: usize| {
+        let vector = database.global(index)?;
+        let squared: f32 = vector
+            .iter()
+            .zip(query)
+            .map(|(a, b)| (a - b) * (a - b))
+            .sum();
+        Some(Neighbour {
+            index,
+            distance: squared.sqrt(),
+        })
+    };
+    let mut all: Vec<Neighbour> = (0..database.len())
+        .into_par_iter()
+        .filter_map(distance)
+        .collect();
+    let order = |a: &Neighbour, b: &Neighbour| {
+        a.distance
+            .total_cmp(&b.distance)
+            .then(a.index.cmp(&b.index))
+    };
+    if k < all.len() {
+        all.select_nth_unstable_by(k, order);
+        all.truncate(k);
+    }
+    all.sort_unstable_by(order);
+    all
+}

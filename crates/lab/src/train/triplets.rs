@@ -1,0 +1,290 @@
+//! Which images show a query's place, and which may serve as its negatives (paper III-F: 10 m and
+//! 25 m).
+
+use super::TrainError;
+use crate::datasets::{Dataset, Item, MetricPoint, NeighbourGrid};
+use placeformer_core::types::ContentHash;
+use std::path::PathBuf;
+
+/// One side of a triplet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Side {
+    /// An image that asks.
+    Query,
+    /// An image that answers: positive or negative.
+    Database,
+}
+
+/// The images to learn from and their relations, computed once.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TripletSet {
+    /// Images that ask.
+    pub queries: Vec<PathBuf>,
+    /// Images that answer.
+    pub database: Vec<PathBuf>,
+    /// For each query, the database images that show its place, ascending.
+    pub positives: Vec<Vec<u32>>,
+    /// For each query, the database images too near to serve as negatives, ascending; includes the
+    /// positives.
+    pub near: Vec<Vec<u32>>,
+}
+
+impl TripletSet {
+    /// Relations by position: positives within `positive_m` metres, negatives beyond `negative_m`.
+    ///
+    /// Images without a position are left out.
+    pub fn by_position(
+        dataset: &Dataset,
+        positive_m: f64,
+        negative_m: f64,
+    ) -> Result<Self, TrainError> {
+        if !(positive_m > 0.0 && positive_m <= negative_m && negative_m.is_finite()) {
+            return Err(TrainError::Setting(format!(
+                "positives within {positive_m} m and negatives beyond {negative_m} m leave no order between them"
+            )));
+        }
+        let (queries, database) = (located(&dataset.queries), located(&dataset.database));
+        let near_of = |radius: f64| -> Vec<Vec<u32>> {
+            let grid = NeighbourGrid::new(radius, database.iter().map(|item| item.1).enumerate());
+            let around = |(query, point): &(&Item, MetricPoint)| {
+                // Coordinates of two cities may coincide.
+                let same_city = |&index: &usize| database[index].0.group == query.group;
+                let mut found: Vec<u32> = grid
+                    .within(*point)
+                    .filter(same_city)
+                    .map(|index| index as u32)
+                    .collect();
+                found.sort_unstable();
+                found
+            };
+            queries.iter().map(around).collect()
+        };
+        let (positives, near) = (near_of(positive_m), near_of(negative_m));
+        let paths =
+            |items: &[(&Item, MetricPoint)]| items.iter().map(|item| item.0.path.clone()).collect();
+        Self {
+            queries: paths(&queries),
+            database: paths(&database),
+            positives,
+            near,
+        }
+        .checked()
+    }
+
+    /// Relations by order, for drives whose frames carry no position: a frame's neighbours up to
+    /// `positive_frames` away show its place, frames of its drive more than `negative_frames` away
+    /// or of another drive do not.
+    pub fn by_order(
+        drives: &[Vec<PathBuf>],
+        positive_frames: usize,
+        negative_frames: usize,
+    ) -> Result<Self, TrainError> {
+        if positive_frames == 0 || positive_frames > negative_frames {
+            return Err(TrainError::Setting(format!(
+                "positives within {positive_frames} frames and negatives beyond {negative_frames} leave no order between them"
+            )));
+        }
+        let images: Vec<PathBuf> = drives.iter().flatten().cloned().collect();
+        let (mut positives, mut near) = (Vec::new(), Vec::new());
+        let mut first = 0;
+        for drive in drives {
+            for frame in 0..drive.len() {
+                let around = |reach: usize| {
+                    let range = frame.saturating_sub(reach)..(frame + reach + 1).min(drive.len());
+                    range.map(move |other| (first + other) as u32)
+                };
+                // A frame is not its own positive, but it is too near to be a negative.
+                positives.push(
+                    around(positive_frames)
+                        .filter(|&other| other as usize != first + frame)
+                        .collect(),
+                );
+                near.push(around(negative_frames).collect());
+            }
+            first += drive.len();
+        }
+        Self {
+            queries: images.clone(),
+            database: images,
+            positives,
+            near,
+        }
+        .checked()
+    }
+
+    /// All `sets` as one. Images of different sets are taken to show different places, so sets of
+    /// one area must be read as one instead.
+    ///
+    /// # Errors
+    /// There is no set.
+    pub fn merge(sets: Vec<Self>) -> Result<Self, TrainError> {
+        let mut all = Self {
+            queries: vec![],
+            database: vec![],
+            positives: vec![],
+            near: vec![],
+        };
+        for set in sets {
+            let first = all.database.len() as u32;
+            let shift = |rows: Vec<Vec<u32>>| {
+                rows.into_iter()
+                    .map(move |row| row.iter().map(|i| first + i).collect())
+            };
+            all.positives.extend(shift(set.positives));
+            all.near.extend(shift(set.near));
+            all.queries.extend(set.queries);
+            all.database.extend(set.database);
+        }
+        all.checked()
+    }
+
+    /// SHA-256 over images and relations, hexadecimal: two runs with the same one learn from the
+    /// same data.
+    pub fn fingerprint(&self) -> String {
+        let mut bytes = Vec::new();
+        for paths in [&self.queries, &self.database] {
+            bytes.extend((paths.len() as u64).to_le_bytes());
+            paths.iter().for_each(|path| {
+                bytes.extend(path.as_os_str().as_encoded_bytes().iter().chain(&[0]))
+            });
+        }
+        for row in self.positives.iter().chain(&self.near) {
+            bytes.extend((row.len() as u32).to_le_bytes());
+            row.iter()
+                .for_each(|index| bytes.extend(index.to_le_bytes()));
+        }
+        ContentHash::of(&bytes).to_string()
+    }
+
+    /// The queries that have a positive and at least one possible negative.
+    pub fn usable(&self) -> impl Iterator<Item = usize> + '_ {
+        (0..self.queries.len()).filter(|&query| {
+            !self.positives[query].is_empty() && self.near[query].len() < self.database.len()
+        })
+    }
+
+    /// The images of one side.
+    pub fn images(&self, side: Side) -> &[PathBuf] {
+        match side {
+            Side::Query => &self.queries,
+            Side::Database => &self.database,
+        }
+    }
+
+    fn checked(self) -> Result<Self, TrainError> {
+        if self.usable().next().is_none() {
+            return Err(TrainError::NoTriplets(format!(
+                "of {} queries and {} database images, no query has both a positive and a negative",
+                self.queries.len(),
+                self.database.len()
+            )));
+        }
+        Ok(self)
+    }
+}
+
+fn located(items: &[Item]) -> Vec<(&Item, MetricPoint)> {
+    items
+        .iter()
+        .filter_map(|item| Some((item, item.position?)))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::datasets::Truth;
+
+    fn at(name: &str, east: f64) -> Item {
+        Item {
+            position: Some(MetricPoint { east, north: 0.0 }),
+            ..Item::new(name, name)
+        }
+    }
+
+    fn dataset(database: Vec<Item>, queries: Vec<Item>) -> Dataset {
+        let truth = vec![Truth::Unknown; queries.len()];
+        Dataset {
+            name: "line".into(),
+            database,
+            queries,
+            truth,
+            skipped: vec![],
+            notes: vec![],
+        }
+    }
+
+    #[test]
+    fn between_ten_and_twenty_five_metres_an_image_is_neither() {
+        let database = vec![
+            at("d0", 0.0),
+            at("d10", 10.0),
+            at("d11", 11.0),
+            at("d25", 25.0),
+            at("d26", 26.0),
+        ];
+        let set =
+            TripletSet::by_position(&dataset(database, vec![at("q", 0.0)]), 10.0, 25.0).unwrap();
+        assert_eq!(set.positives, [[0, 1]]);
+        assert_eq!(set.near, [[0, 1, 2, 3]]);
+    }
+
+    #[test]
+    fn images_without_a_position_are_left_out_and_nothing_to_learn_is_an_error() {
+        let database = vec![Item::new("lost", "lost"), at("far", 1000.0)];
+        let error = TripletSet::by_position(&dataset(database, vec![at("q", 0.0)]), 10.0, 25.0)
+            .unwrap_err();
+        assert!(matches!(error, TrainError::NoTriplets(_)), "{error}");
+    }
+
+    #[test]
+    fn another_city_is_never_near_whatever_its_coordinates() {
+        let city = |item: Item, name: &str| Item {
+            group: Some(name.into()),
+            ..item
+        };
+        let database = vec![city(at("a", 0.0), "x"), city(at("b", 0.0), "y")];
+        let set = TripletSet::by_position(
+            &dataset(database, vec![city(at("q", 1.0), "y")]),
+            10.0,
+            25.0,
+        )
+        .unwrap();
+        assert_eq!(
+            (&set.positives, &set.near),
+            (&vec![vec![1]], &vec![vec![1]])
+        );
+    }
+
+    #[test]
+    fn merged_sets_keep_their_relations_and_are_negatives_of_each_other() {
+        let drive = |name: &str| {
+            (0..5)
+                .map(|i| PathBuf::from(format!("{name}/{i}")))
+                .collect::<Vec<_>>()
+        };
+        let set = |name: &str| TripletSet::by_order(&[drive(name)], 1, 2).unwrap();
+        let merged = TripletSet::merge(vec![set("a"), set("b")]).unwrap();
+        assert_eq!(
+            merged,
+            TripletSet::by_order(&[drive("a"), drive("b")], 1, 2).unwrap()
+        );
+        assert_eq!(merged.fingerprint(), merged.clone().fingerprint());
+        assert_ne!(merged.fingerprint(), set("a").fingerprint());
+        assert!(TripletSet::merge(vec![]).is_err());
+    }
+
+    #[test]
+    fn frames_of_another_drive_are_negatives() {
+        let drive = |name: &str| {
+            (0..5)
+                .map(|i| PathBuf::from(format!("{name}/{i}")))
+                .collect::<Vec<_>>()
+        };
+        let set = TripletSet::by_order(&[drive("a"), drive("b")], 1, 2).unwrap();
+        assert_eq!(set.positives[5], [6]);
+        assert_eq!(set.positives[2], [1, 3]);
+        assert_eq!(set.near[4], [2, 3, 4]);
+        assert_eq!(set.usable().count(), 10);
+    }
+}

@@ -1,0 +1,193 @@
+//! Why the store could not do as asked.
+
+use placeformer_core::error::ErrorCode;
+use placeformer_core::types::{ExternalId, MapName, ModelId, ReferenceId};
+use std::path::PathBuf;
+
+/// The cause inside an engine failure; opaque, so that no type of the engine leaves the store.
+pub type EngineCause = Box<dyn std::error::Error + Send + Sync>;
+
+/// Why the store could not do as asked.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum StoreError {
+    /// No map of this name.
+    #[error("map {map} does not exist")]
+    MapNotFound {
+        /// The name asked for.
+        map: MapName,
+    },
+    /// No reference of this identity.
+    #[error("reference {id} does not exist")]
+    ReferenceNotFound {
+        /// The identity asked for.
+        id: ReferenceId,
+    },
+    /// The external id belongs to a reference with other content.
+    #[error(
+        "external id {external_id} of map {map} belongs to reference {existing}, which has other content"
+    )]
+    ExternalIdConflict {
+        /// The map.
+        map: MapName,
+        /// The contested name.
+        external_id: ExternalId,
+        /// Who has it.
+        existing: ReferenceId,
+    },
+    /// The map was built with another model.
+    #[error("map {map} is bound to model {bound}; the descriptor comes from model {given}")]
+    ModelMismatch {
+        /// The map.
+        map: MapName,
+        /// The model all its descriptors come from.
+        bound: ModelId,
+        /// The model of the descriptor offered.
+        given: ModelId,
+    },
+    /// The calibration was fitted for another model than the map's.
+    #[error("map {map} is bound to model {bound}; the calibration was fitted for model {given}")]
+    CalibrationMismatch {
+        /// The map.
+        map: MapName,
+        /// The model all its descriptors come from.
+        bound: ModelId,
+        /// The model of the calibration offered.
+        given: ModelId,
+    },
+    /// A reference fails its checksum; it is quarantined.
+    #[error(
+        "reference {id} is damaged on disk and quarantined: {reason}; delete it or send its image again"
+    )]
+    Corrupt {
+        /// Which.
+        id: ReferenceId,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A map's own record fails its checksum.
+    #[error("the record of map {map} is damaged on disk; restore a backup, or delete the map")]
+    CorruptMap {
+        /// Its name as far as it can be read.
+        map: String,
+    },
+    /// The head that a map keeps for itself fails its checksum.
+    #[error(
+        "the head that map {map} keeps is damaged on disk; give it a head again, its references are whole"
+    )]
+    CorruptHead {
+        /// The map.
+        map: MapName,
+    },
+    /// A part of the database that belongs to no single record is damaged.
+    #[error(
+        "the database is damaged, noticed while {context}: {source}; check the stopped store, or restore a backup"
+    )]
+    Damaged {
+        /// What was being done.
+        context: &'static str,
+        /// What the engine said.
+        source: EngineCause,
+    },
+    /// The descriptor offered breaks a rule of its type: a fault of the caller.
+    #[error("the descriptor cannot be stored: {reason}")]
+    InvalidDescriptor {
+        /// Which rule.
+        reason: String,
+    },
+    /// No space is left for writing; reading and deleting still work.
+    #[error("no space is left on the disk of the data directory")]
+    DiskFull,
+    /// Another process uses the data directory.
+    #[error("the data directory {} is in use by another process ({holder})", directory.display())]
+    Locked {
+        /// The data directory.
+        directory: PathBuf,
+        /// What the lock file says about its holder.
+        holder: String,
+    },
+    /// The database was written by a newer release.
+    #[error(
+        "the database has schema version {found}, this release knows up to {supported}: use a newer release"
+    )]
+    SchemaTooNew {
+        /// Version on disk.
+        found: i64,
+        /// Newest version known here.
+        supported: i64,
+    },
+    /// A migration that was applied is not the one this release carries.
+    #[error(
+        "migration {version} was applied with other content than this release carries; the database is not ours"
+    )]
+    MigrationChanged {
+        /// Its number.
+        version: i64,
+    },
+    /// The database was busy longer than it should ever be.
+    #[error("the database is busy: {context}")]
+    Busy {
+        /// What was being done.
+        context: &'static str,
+    },
+    /// A head is already being exchanged on this map.
+    #[error("map {map} is already being given another head")]
+    ReheadInProgress {
+        /// The map.
+        map: MapName,
+    },
+    /// The target of a backup exists already.
+    #[error("{} exists already; a backup never overwrites", path.display())]
+    BackupExists {
+        /// The target.
+        path: PathBuf,
+    },
+    /// The store is closing.
+    #[error("the store is closing")]
+    Closing,
+    /// The file system refused.
+    #[error("{context} {}: {source}", path.display())]
+    Io {
+        /// What was being done.
+        context: &'static str,
+        /// To which file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The engine refused.
+    #[error("the database failed while {context}: {source}")]
+    Engine {
+        /// What was being done.
+        context: &'static str,
+        /// What the engine said.
+        source: EngineCause,
+    },
+}
+
+impl StoreError {
+    /// The row of the error table.
+    pub fn code(&self) -> ErrorCode {
+        match self {
+            Self::MapNotFound { .. } => ErrorCode::MapNotFound,
+            Self::ReferenceNotFound { .. } => ErrorCode::ReferenceNotFound,
+            Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
+            Self::ModelMismatch { .. } => ErrorCode::ModelMismatch,
+            Self::CalibrationMismatch { .. } => ErrorCode::CalibrationMismatch,
+            Self::Corrupt { .. }
+            | Self::CorruptMap { .. }
+            | Self::CorruptHead { .. }
+            | Self::Damaged { .. } => ErrorCode::CorruptRecord,
+            Self::DiskFull => ErrorCode::DiskFull,
+            Self::Busy { .. } | Self::ReheadInProgress { .. } => ErrorCode::Overloaded,
+            Self::Closing => ErrorCode::ShuttingDown,
+            Self::InvalidDescriptor { .. }
+            | Self::Locked { .. }
+            | Self::SchemaTooNew { .. }
+            | Self::MigrationChanged { .. }
+            | Self::BackupExists { .. }
+            | Self::Io { .. }
+            | Self::Engine { .. } => ErrorCode::Internal,
+        }
+    }
+}

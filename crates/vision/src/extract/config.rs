@@ -1,0 +1,291 @@
+//! Settings of extraction: every point the paper leaves open, by name.
+
+use super::encoder::{EncoderSpec, Precision};
+use super::preset::Preset;
+use placeformer_core::types::{ImageSize, InvalidValue, PoolingStride, SCALES};
+use serde::{Deserialize, Serialize};
+use std::convert::Infallible;
+use std::fmt;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+/// Settings of extraction. What is `None` is the preset's own; see [`ExtractConfig::effective`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ExtractConfig {
+    /// The backbone.
+    pub preset: Preset,
+    /// Weights file of one's own for the preset's geometry; the preset's published ones, pulled on
+    /// first use, unless set.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub weights: Option<PathBuf>,
+    /// Size images are squashed to, each side a multiple of the patch size.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub input_size: Option<ImageSize>,
+    /// 0-based block whose tokens are used; later blocks are not computed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub exit_block: Option<usize>,
+    /// Whether the tokens pass the final LayerNorm.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub token_norm: Option<bool>,
+    /// 0-based block whose CLS attention ranks patches; the exit block unless set.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub attention_block: Option<usize>,
+    /// Attention heads, for weights trained with another count than the preset's (no tensor's shape
+    /// reveals it).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub heads: Option<usize>,
+    /// Key patches must exceed this multiple of the uniform attention heads/n; 1 is the paper's
+    /// 0.01.
+    pub tau: f32,
+    /// Most key patches at scales 1, 2 and 3.
+    pub caps: [usize; SCALES],
+    /// Distance between fused windows.
+    pub stride: PoolingStride,
+    /// The projection to the global descriptor: `default`, `none`, or a file.
+    pub head: HeadChoice,
+    /// Arithmetic of the linear layers.
+    pub precision: Precision,
+}
+
+impl Default for ExtractConfig {
+    fn default() -> Self {
+        Self {
+            preset: Preset::default(),
+            weights: None,
+            input_size: None,
+            exit_block: None,
+            token_norm: None,
+            attention_block: None,
+            heads: None,
+            tau: 1.0,
+            caps: [400, 200, 50],
+            stride: PoolingStride::default(),
+            head: HeadChoice::default(),
+            precision: Precision::default(),
+        }
+    }
+}
+
+/// Which projection makes the global descriptor.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(from = "String", into = "String")]
+pub enum HeadChoice {
+    /// The one built in for this backbone; an error where there is none.
+    #[default]
+    Default,
+    /// None: the pooled token itself, of the backbone's width. For evaluation and for fitting
+    /// heads; not searchable.
+    None,
+    /// A file.
+    File(PathBuf),
+}
+
+impl From<String> for HeadChoice {
+    fn from(text: String) -> Self {
+        match text.as_str() {
+            "default" => Self::Default,
+            "none" => Self::None,
+            _ => Self::File(text.into()),
+        }
+    }
+}
+
+impl From<HeadChoice> for String {
+    fn from(choice: HeadChoice) -> Self {
+        choice.to_string()
+    }
+}
+
+impl FromStr for HeadChoice {
+    type Err = Infallible;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        Ok(text.to_owned().into())
+    }
+}
+
+impl fmt::Display for HeadChoice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Default => f.write_str("default"),
+            Self::None => f.write_str("none"),
+            Self::File(path) => write!(f, "{}", path.display()),
+        }
+    }
+}
+
+impl ExtractConfig {
+    /// The size images are squashed to.
+    pub fn input_size(&self) -> ImageSize {
+        self.input_size.unwrap_or(self.preset.input_size())
+    }
+
+    /// What an encoder must compute, checked against the preset's geometry.
+    pub fn encoder_spec(&self) -> Result<EncoderSpec, InvalidValue> {
+        let exit_block = self.exit_block.unwrap_or(self.preset.exit_block());
+        let spec = EncoderSpec {
+            input_size: self.input_size(),
+            exit_block,
+            token_norm: self.token_norm.unwrap_or(self.preset.token_norm()),
+            attention_block: self.attention_block.unwrap_or(exit_block),
+        };
+        self.validate(&spec)?;
+        Ok(spec)
+    }
+
+    /// The same settings with the preset's own values filled in.
+    pub fn effective(&self) -> Result<Self, InvalidValue> {
+        let spec = self.encoder_spec()?;
+        Ok(Self {
+            input_size: Some(spec.input_size),
+            exit_block: Some(spec.exit_block),
+            token_norm: Some(spec.token_norm),
+            attention_block: Some(spec.attention_block),
+            ..self.clone()
+        })
+    }
+
+    fn validate(&self, spec: &EncoderSpec) -> Result<(), InvalidValue> {
+        /// Sides beyond this make a grid that the stored index (16 bits) cannot hold.
+        const LARGEST_GRID: usize = u16::MAX as usize + 1;
+        let geometry = self.preset.geometry();
+        let (size, patch) = (spec.input_size, geometry.patch as u32);
+        let refuse = |field, reason: String| Err(InvalidValue::new(field, reason));
+        if size.width == 0
+            || size.height == 0
+            || size.width % patch != 0
+            || size.height % patch != 0
+        {
+            let nearest = |side: u32| ((side + patch / 2) / patch).max(1) * patch;
+            let suggestion = ImageSize {
+                width: nearest(size.width),
+                height: nearest(size.height),
+            };
+            return refuse(
+                "input_size",
+                format!("{size} is not whole patches of {patch} pixels; try {suggestion}"),
+            );
+        }
+        let (columns, rows) = geometry.grid(size);
+        if columns.saturating_mul(rows) > LARGEST_GRID {
+            return refuse(
+                "input_size",
+                format!("{size} makes more than {LARGEST_GRID} patches"),
+            );
+        }
+        for (field, block) in [
+            ("exit_block", spec.exit_block),
+            ("attention_block", spec.attention_block),
+        ] {
+            if block >= geometry.depth {
+                return refuse(
+                    field,
+                    format!("{block} is beyond the last block, {}", geometry.depth - 1),
+                );
+            }
+        }
+        if let Some(heads) = self
+            .heads
+            .filter(|&heads| heads == 0 || !geometry.dim.is_multiple_of(heads))
+        {
+            return refuse(
+                "heads",
+                format!("{heads} does not divide the token width {}", geometry.dim),
+            );
+        }
+        if !self.tau.is_finite() || self.tau < 0.0 {
+            return refuse("tau", format!("{} is not a non-negative number", self.tau));
+        }
+        if self.caps.iter().any(|&cap| cap > LARGEST_GRID) || self.caps.iter().all(|&cap| cap == 0)
+        {
+            return refuse(
+                "caps",
+                format!(
+                    "{:?} must hold a positive number and none above {LARGEST_GRID}",
+                    self.caps
+                ),
+            );
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_unset_is_the_presets() {
+        let spec = ExtractConfig::default().encoder_spec().unwrap();
+        assert_eq!(
+            (
+                spec.exit_block,
+                spec.attention_block,
+                spec.token_norm,
+                spec.blocks()
+            ),
+            (8, 8, false, 9)
+        );
+        let paper = ExtractConfig {
+            preset: Preset::PlaceformerVits16,
+            ..Default::default()
+        }
+        .encoder_spec()
+        .unwrap();
+        assert_eq!((paper.exit_block, paper.token_norm), (11, true));
+        assert_eq!(
+            paper.input_size,
+            ImageSize {
+                width: 640,
+                height: 480
+            }
+        );
+    }
+
+    #[test]
+    fn settings_survive_toml() {
+        let config = ExtractConfig {
+            head: HeadChoice::File("h.safetensors".into()),
+            ..Default::default()
+        };
+        let config = config.effective().unwrap();
+        assert_eq!(
+            toml::from_str::<ExtractConfig>(&toml::to_string(&config).unwrap()).unwrap(),
+            config
+        );
+        assert!(
+            toml::from_str::<ExtractConfig>("tua = 1.0")
+                .unwrap_err()
+                .to_string()
+                .contains("tua")
+        );
+    }
+
+    #[test]
+    fn each_broken_rule_is_named() {
+        let broken = |change: fn(&mut ExtractConfig)| {
+            let mut config = ExtractConfig::default();
+            change(&mut config);
+            config.encoder_spec().unwrap_err()
+        };
+        let wrong_size = broken(|c| {
+            c.input_size = Some(ImageSize {
+                width: 640,
+                height: 480,
+            })
+        });
+        assert!(
+            wrong_size.field == "input_size" && wrong_size.reason.contains("644x476"),
+            "{wrong_size}"
+        );
+        assert_eq!(broken(|c| c.exit_block = Some(12)).field, "exit_block");
+        assert_eq!(
+            broken(|c| c.attention_block = Some(12)).field,
+            "attention_block"
+        );
+        assert_eq!(broken(|c| c.heads = Some(7)).field, "heads");
+        assert_eq!(broken(|c| c.tau = f32::NAN).field, "tau");
+        assert_eq!(broken(|c| c.caps = [0, 0, 0]).field, "caps");
+    }
+}
