@@ -5,9 +5,9 @@
 //! library on the same file.
 
 use criterion::{Criterion, criterion_group, criterion_main};
+use placeformer_core::types::ImageSize;
 use placeformer_lab::bench::{baselines, scenes::photo};
 use placeformer_vision::image::{ImageConfig, load_tensor};
-use placeformer_core::types::ImageSize;
 use std::hint::black_box;
 
 const TARGET: ImageSize = ImageSize {

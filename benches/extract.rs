@@ -2,12 +2,12 @@
 //! this CPU, beside the candle one. Weights are random, which costs the same as learned ones.
 
 use criterion::{Criterion, criterion_group, criterion_main};
+use placeformer_core::types::ImageTensor;
+use placeformer_kernels::Simd;
 use placeformer_vision::extract::{
     BlockWeights, CandleEncoder, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm,
     Precision, Preset, VitWeights,
 };
-use placeformer_kernels::Simd;
-use placeformer_core::types::ImageTensor;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

@@ -8,15 +8,15 @@
 //! `PLACEFORMER_BENCH_EXPORT=DIR` writes the same data as safetensors for
 //! `benches/peers/rerank_opencv.py`, along with our inlier counts, and stops.
 
-use placeformer_vision::extract::pack;
 use criterion::{BenchmarkId, Criterion};
+use placeformer_core::types::{PackedPatches, ScaleSet};
+use placeformer_kernels::simd;
 use placeformer_lab::bench::baselines::{self, joined};
 use placeformer_lab::bench::scenes::{CANDIDATES, CAPS, DIM, RerankScene};
 use placeformer_lab::bench::store_scene;
-use placeformer_kernels::simd;
-use placeformer_vision::rerank::{RerankConfig, Reranked, Reranker};
 use placeformer_store::PlaceStore;
-use placeformer_core::types::{PackedPatches, ScaleSet};
+use placeformer_vision::extract::pack;
+use placeformer_vision::rerank::{RerankConfig, Reranked, Reranker};
 use rayon::prelude::*;
 use std::hint::black_box;
 use std::path::Path;
@@ -133,11 +133,7 @@ fn matches(
 /// The homographies alone, on one thread, and what a store adds.
 fn bench_parts(criterion: &mut Criterion, percent: u32, scene: &RerankScene) {
     let query = pack(&scene.query);
-    let candidates: Vec<_> = scene
-        .candidates
-        .iter()
-        .map(pack)
-        .collect();
+    let candidates: Vec<_> = scene.candidates.iter().map(pack).collect();
     let reranker = Reranker::new(RerankConfig::default());
     let problems = matches(&reranker, &query, &candidates);
     let mut group = criterion.benchmark_group("ransac");
@@ -180,11 +176,7 @@ fn bench_parts(criterion: &mut Criterion, percent: u32, scene: &RerankScene) {
 
 fn bench(criterion: &mut Criterion, percent: u32, scene: &RerankScene) {
     let query = pack(&scene.query);
-    let candidates: Vec<_> = scene
-        .candidates
-        .iter()
-        .map(pack)
-        .collect();
+    let candidates: Vec<_> = scene.candidates.iter().map(pack).collect();
     let reranker = Reranker::new(RerankConfig::default());
     let matching = Reranker::new(RerankConfig {
         max_iterations: 0,

@@ -4,10 +4,10 @@
 //! of memory). `benches/peers/search_faiss.py` measures faiss at the same sizes.
 
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use placeformer_core::types::{GeoCircle, GeoPoint, ReferenceFilter};
 use placeformer_lab::bench::baselines;
 use placeformer_lab::bench::scenes::{index_entry, unit_vector};
 use placeformer_vision::search::{IndexEntry, MapIndex};
-use placeformer_core::types::{GeoCircle, GeoPoint, ReferenceFilter};
 use rayon::prelude::*;
 use std::hint::black_box;
 

@@ -8,16 +8,16 @@
 //! An environment variable names its key with `__` between the levels:
 //! `PLACEFORMER_HTTP__LISTEN=0.0.0.0:80` is `listen` of `[http]`.
 
-use placeformer_vision::extract::{ExtractConfig, HeadChoice, Precision, Preset};
 use crate::http::{AuthConfig, HttpConfig};
-use placeformer_vision::image::ImageConfig;
 use crate::ops::LogConfig;
 use crate::pipeline::PipelineConfig;
-use placeformer_vision::rerank::RerankConfig;
-use placeformer_store::StoreConfig;
-use placeformer_core::types::InvalidValue;
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
+use placeformer_core::types::InvalidValue;
+use placeformer_store::StoreConfig;
+use placeformer_vision::extract::{ExtractConfig, HeadChoice, Precision, Preset};
+use placeformer_vision::image::ImageConfig;
+use placeformer_vision::rerank::RerankConfig;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};

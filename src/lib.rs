@@ -1,6 +1,6 @@
 //! PlaceFormer: which mapped place does this photo show?
 //!
-//! The way of the data, and the rooms it passes through:
+//! The way of the data:
 //!
 //! ```text
 //! bytes --image--> RGB tensor --extract--> Descriptor { global [256], key patches at 3 scales }
@@ -9,44 +9,32 @@
 //!         query:  global --search--> 100 candidates --store--> their key patches --rerank--> ranked places
 //! ```
 //!
+//! This package is the service and its command line:
+//!
 //! | module | holds |
 //! |---|---|
-//! | [`types`] | the nouns: identifiers, locations, descriptors, references |
-//! | [`error`] | the one table of error codes |
-//! | [`kernels`] | SIMD inner loops with scalar twins; the only `unsafe` code |
-//! | [`image`], [`extract`], [`search`], [`store`], [`rerank`] | the five stages; none imports another |
-//! | [`pipeline`] | the only code that composes the stages |
 //! | [`http`] | the web surface over the pipeline |
+//! | [`pipeline`] | the only code that composes the stages |
 //! | [`config`], [`ops`] | settings; metrics, logs, health, shutdown |
-//! | [`eval`], [`train`] | recall on data sets; learning the head and the backbone |
-//! | [`synth`], [`draw`] | the street renderer behind the demo map; pictures of matches |
-//! | [`mod@bench`] | every stage beside a plain implementation and the machine's limit |
+//! | [`server`] | settings to a running server |
 //! | [`cli`] | one file per subcommand |
 //!
-//! Imports point one way, `http -> pipeline -> stages -> {types, error, kernels}`;
-//! `tests/architecture.rs` fails on a back edge.
-#![deny(unsafe_code)]
-#![warn(missing_docs)]
+//! It stands on the crates of the workspace, whose dependencies Cargo keeps one-way:
+//!
+//! | crate | holds |
+//! |---|---|
+//! | `placeformer-core` | types, the one table of error codes, durable files, geography |
+//! | `placeformer-kernels` | SIMD inner loops with scalar twins; the only `unsafe` code |
+//! | `placeformer-vision` | the stages `image`, `extract`, `search` and `rerank`: pure computation |
+//! | `placeformer-models` | where the weights of a preset come from |
+//! | `placeformer-store` | references and their descriptors on disk |
+//! | `placeformer-lab` | data sets, evaluation, training, drawn streets, benchmarks |
+//!
+//! `tests/architecture.rs` keeps what Cargo cannot: `http -> pipeline`, and axum only in `http`.
 
-pub mod bench;
 pub mod cli;
 pub mod config;
-pub mod draw;
-pub mod error;
-pub mod eval;
-pub mod extract;
 pub mod http;
-pub mod image;
-#[allow(
-    unsafe_code,
-    reason = "the one room for it: SIMD kernels, each with a scalar twin"
-)]
-pub mod kernels;
 pub mod ops;
 pub mod pipeline;
-pub mod rerank;
-pub mod search;
-pub mod store;
-pub mod synth;
-pub mod train;
-pub mod types;
+pub mod server;

@@ -1,16 +1,16 @@
 //! In the steady state, the stages of a query allocate their answers and little else: buffers are
 //! kept, matrices of similarities and scores never exist.
 
-use placeformer_vision::extract::pack;
+use placeformer_core::types::{ImageSize, ImageTensor, ReferenceFilter};
+use placeformer_kernels::Simd;
 use placeformer_lab::bench::scenes::{CANDIDATES, RerankScene, index_entry, unit_vector};
+use placeformer_vision::extract::pack;
 use placeformer_vision::extract::{
     BlockWeights, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm, Precision, Preset,
     VitWeights,
 };
-use placeformer_kernels::Simd;
 use placeformer_vision::rerank::{RerankConfig, Reranker};
 use placeformer_vision::search::MapIndex;
-use placeformer_core::types::{ImageSize, ImageTensor, PackedPatches, ReferenceFilter};
 use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
 use std::alloc::System;
 use std::sync::Mutex;
@@ -129,11 +129,7 @@ fn extraction_allocates_its_answer() {
 fn reranking_allocates_no_matrices() {
     let scene = RerankScene::new(0.4);
     let query = pack(&scene.query);
-    let candidates: Vec<_> = scene
-        .candidates
-        .iter()
-        .map(pack)
-        .collect();
+    let candidates: Vec<_> = scene.candidates.iter().map(pack).collect();
     let reranker = Reranker::new(RerankConfig::default());
     let bytes = steady_bytes(|| {
         reranker.rerank(

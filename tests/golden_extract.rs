@@ -5,13 +5,13 @@
 //! between near-equal attentions. From the picture file, pixels within 0.02 and the global
 //! descriptor's cosine at least 0.9999.
 
+use placeformer_core::types::{ImageSize, ImageTensor};
 use placeformer_models::model_path;
 use placeformer_vision::extract::{
     CandleEncoder, ExtractConfig, ExtractError, ExtractionTrace, Extractor, HeadChoice, Precision,
     Preset, TraceArray, TraceValues, VitWeights,
 };
 use placeformer_vision::image::{ImageConfig, load_tensor};
-use placeformer_core::types::{ImageSize, ImageTensor};
 use safetensors::SafeTensors;
 use std::collections::BTreeMap;
 use std::sync::OnceLock;

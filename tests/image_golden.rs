@@ -1,7 +1,7 @@
 //! The tensor of a PNG against Pillow's resize and ImageNet normalisation.
 
-use placeformer_vision::image::{ImageConfig, load_tensor};
 use placeformer_core::types::ImageSize;
+use placeformer_vision::image::{ImageConfig, load_tensor};
 use std::path::Path;
 
 #[test]

@@ -2,10 +2,10 @@
 
 use exif::{Field, In, Rational, Tag, Value, experimental::Writer};
 use image::{DynamicImage, ImageFormat};
+use placeformer_core::types::ImageSize;
 use placeformer_vision::image::{
     ImageConfig, ImageError, RgbImage, decode, encode_jpeg, encode_png, load_tensor, read_exif,
 };
-use placeformer_core::types::ImageSize;
 use proptest::prelude::*;
 use std::io::Cursor;
 use std::path::Path;

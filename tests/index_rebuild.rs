@@ -7,16 +7,16 @@ mod support;
 
 use bytes::Bytes;
 use placeformer::config::Config;
-use placeformer_core::error::ErrorCode;
 use placeformer::pipeline::{IngestRequest, QueryOptions, QueryRequest, Service};
-use placeformer_vision::search::{IndexBuilder, IndexEntry, MapIndex};
-use placeformer_store::{
-    Inserted, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, apply_patch,
-};
+use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{
     ContentHash, GLOBAL_DIM, GeoCircle, GeoPoint, MapName, NewReference, Reference,
     ReferenceFields, ReferenceFilter, ReferenceId,
 };
+use placeformer_store::{
+    Inserted, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, apply_patch,
+};
+use placeformer_vision::search::{IndexBuilder, IndexEntry, MapIndex};
 use places::{map, named_reference, reference, unit_vector};
 use proptest::prelude::*;
 use std::collections::BTreeMap;

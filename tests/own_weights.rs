@@ -1,11 +1,11 @@
 //! A server of one's own weights and head, as `train` writes them, and where its settings come
 //! from: the real binary.
 
-use placeformer_vision::extract::{
-    Aggregate, BlockWeights, ExtractConfig, Extractor, Head, HeadChoice, Linear, Norm, Preset,
-    VitWeights,
-};
 use placeformer_core::types::{GLOBAL_DIM, ImageSize};
+use placeformer_models::open_extractor;
+use placeformer_vision::extract::{
+    Aggregate, BlockWeights, ExtractConfig, Head, HeadChoice, Linear, Norm, Preset, VitWeights,
+};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::io::{BufRead, BufReader};
@@ -79,7 +79,7 @@ impl Own {
             ..Default::default()
         };
         weights().save(config.weights.as_ref().unwrap()).unwrap();
-        let without_head = Extractor::open(&config).unwrap();
+        let without_head = open_extractor(&config).unwrap();
         let weight = (0..GLOBAL_DIM * 384)
             .map(|i| ((i * 37 % 101) as f32 - 50.0) / 100.0)
             .collect();
@@ -94,7 +94,7 @@ impl Own {
         .unwrap();
         let head_path = folder.path().join("head.safetensors");
         head.save(&head_path).unwrap();
-        let with_head = Extractor::open(&ExtractConfig {
+        let with_head = open_extractor(&ExtractConfig {
             head: HeadChoice::File(head_path),
             ..config
         })

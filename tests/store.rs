@@ -4,12 +4,12 @@
 mod places;
 
 use placeformer_core::error::ErrorCode;
-use placeformer_store::{
-    Inserted, NewHead, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, StoreError,
-};
 use placeformer_core::types::{
     Calibration, ConfidenceCurve, ConfidenceWeights, GLOBAL_DIM, GeoPoint, Heading, MapName,
     ModelId, NewReference, Reference, ReferenceId, RerankId,
+};
+use placeformer_store::{
+    Inserted, NewHead, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, StoreError,
 };
 use places::{MODEL, map, named_reference, reference};
 use std::collections::{BTreeMap, HashSet};

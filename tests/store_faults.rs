@@ -6,10 +6,10 @@ mod places;
 #[path = "common/small_disk.rs"]
 mod small_disk;
 
+use placeformer_core::types::{GLOBAL_DIM, MapName, ModelId, NewReference, Reference, ReferenceId};
 use placeformer_store::{
     Inserted, NewHead, PlaceStore, SqliteStore, StoreConfig, StoreError, codec, crash_points,
 };
-use placeformer_core::types::{GLOBAL_DIM, MapName, ModelId, NewReference, Reference, ReferenceId};
 use places::{MODEL, map, named_reference, reference};
 use rand::{RngExt, SeedableRng};
 use small_disk::SmallDisk;

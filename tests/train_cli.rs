@@ -3,8 +3,8 @@
 #[path = "common/town.rs"]
 mod town;
 
-use placeformer_vision::extract::{Aggregate, Head, Preset, VitWeights};
 use placeformer_store::{PlaceStore, SqliteStore, StoreConfig};
+use placeformer_vision::extract::{Aggregate, Head, Preset, VitWeights};
 use std::path::Path;
 use std::process::Command;
 use town::{SERVED_SIZE, SIZE, has_model, refusal, succeeds, town};

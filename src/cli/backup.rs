@@ -2,8 +2,8 @@
 
 use crate::cli::output::say;
 use crate::config::{Config, Overrides};
-use placeformer_store::SqliteStore;
 use anyhow::{Context, ensure};
+use placeformer_store::SqliteStore;
 use std::path::PathBuf;
 
 /// Arguments of this subcommand.

@@ -2,10 +2,11 @@
 
 use super::model_args::ModelOptions;
 use crate::cli::output::{OutputError, say};
-use placeformer_vision::extract::{ExtractionTrace, Extractor, TraceArray, TraceValues};
-use placeformer_vision::image::{ImageConfig, load_tensor};
 use anyhow::Context;
 use clap::Args;
+use placeformer_models::open_extractor;
+use placeformer_vision::extract::{ExtractionTrace, Extractor, TraceArray, TraceValues};
+use placeformer_vision::image::{ImageConfig, load_tensor};
 use safetensors::tensor::{Dtype, TensorView};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -27,7 +28,7 @@ pub struct ExtractArgs {
 
 /// Runs it.
 pub fn run(args: ExtractArgs) -> anyhow::Result<()> {
-    let extractor = Extractor::open(&args.model.extract_config()?)?;
+    let extractor = open_extractor(&args.model.extract_config()?)?;
     let bytes = std::fs::read(&args.image).with_context(|| args.image.display().to_string())?;
     let image = load_tensor(&bytes, &ImageConfig::default(), extractor.input_size())
         .with_context(|| args.image.display().to_string())?;

@@ -3,16 +3,18 @@
 use super::model_args::ModelOptions;
 use super::train::{HeadTrainArgs, train_head};
 use crate::cli::output::say;
-use placeformer_lab::datasets::list_images as images_below;
-use placeformer_vision::extract::{
-    Aggregate, Covariance, ExtractConfig, Extractor, Head, HeadChoice, VladWords,
-    half_whitened_head_of_few, hash_file, sample_tokens,
-};
-use placeformer_vision::image::{ImageConfig, load_tensor};
-use placeformer_core::types::ImageTensor;
 use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
+use placeformer_core::files::hash_file;
+use placeformer_core::folder::list_images as images_below;
+use placeformer_core::types::ImageTensor;
+use placeformer_models::open_extractor;
+use placeformer_vision::extract::{
+    Aggregate, Covariance, ExtractConfig, Extractor, Head, HeadChoice, VladWords,
+    half_whitened_head_of_few, sample_tokens,
+};
+use placeformer_vision::image::{ImageConfig, load_tensor};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -107,7 +109,7 @@ fn fit(args: FitArgs) -> anyhow::Result<()> {
         None
     };
     let mut reader = Reader {
-        extractor: Extractor::open(&config)?,
+        extractor: open_extractor(&config)?,
         unreadable: BTreeSet::new(),
     };
     let (aggregate, files) = match (args.aggregate, gem) {

@@ -4,12 +4,12 @@
 use super::client::{ServerArgs, ServerClient};
 use crate::cli::output::{say, say_part};
 use crate::config::{Config, Overrides};
-use placeformer_vision::extract::Head;
-use placeformer_store::{HeadExchange, NewHead};
-use placeformer_core::types::MapName;
 use anyhow::{Context, bail, ensure};
 use clap::Subcommand;
 use indicatif::{ProgressBar, ProgressStyle};
+use placeformer_core::types::MapName;
+use placeformer_store::{HeadExchange, NewHead};
+use placeformer_vision::extract::Head;
 use rayon::prelude::*;
 use serde_json::Value;
 use std::io;
@@ -214,7 +214,7 @@ fn rehead_stopped(
 ) -> anyhow::Result<()> {
     let config = Config::load(config, &Overrides::default())?;
     ensure!(data.is_dir(), "there is no store in {}", data.display());
-    let store = super::serve::open_store(data, &config.store)?;
+    let store = crate::server::open_store(data, &config.store)?;
     // All are looked at before any is changed.
     let mut plan = Vec::new();
     for map in maps {

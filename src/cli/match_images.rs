@@ -2,12 +2,12 @@
 
 use super::model_args::ModelOptions;
 use crate::cli::output::{OutputError, say};
+use anyhow::{Context, bail};
+use placeformer_core::types::ScaleSet;
 use placeformer_lab::eval::evidence::{Seen, picture};
-use placeformer_vision::extract::Extractor;
+use placeformer_models::open_extractor;
 use placeformer_vision::image::{ImageConfig, encode_jpeg, encode_png};
 use placeformer_vision::rerank::{CombinationMatch, RerankConfig, Reranker};
-use placeformer_core::types::ScaleSet;
-use anyhow::{Context, bail};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -53,7 +53,7 @@ pub fn run(args: MatchArgs) -> anyhow::Result<()> {
     } else {
         Some(encoder(&args.out)?)
     };
-    let extractor = Extractor::open(&args.model.extract_config()?)?;
+    let extractor = open_extractor(&args.model.extract_config()?)?;
     let limits = ImageConfig::default();
     let see = |path: &Path| {
         let bytes =

@@ -1,12 +1,12 @@
 //! Obtain and inspect models.
 
 use crate::cli::output::say;
+use anyhow::Context;
+use clap::{Args, Subcommand};
 use placeformer_models::{model_path, pull_model, resolve_model};
 use placeformer_vision::extract::{
     ExtractConfig, ExtractError, Extractor, HeadChoice, Preset, Record, VitWeights,
 };
-use anyhow::Context;
-use clap::{Args, Subcommand};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -98,7 +98,9 @@ fn info(args: InfoArgs) -> anyhow::Result<()> {
     };
     let sha256 = match &record {
         Some(Record { sha256, .. }) => sha256.clone(),
-        None => placeformer_vision::extract::hash_file(&path).with_context(|| path.display().to_string())?,
+        None => {
+            placeformer_core::files::hash_file(&path).with_context(|| path.display().to_string())?
+        }
     };
     let report = json!({
         "preset": preset,

@@ -1,7 +1,7 @@
 //! Flags that choose the model and its settings, for the subcommands that run it themselves.
 
-use placeformer_vision::extract::{ExtractConfig, HeadChoice, Precision, Preset};
 use placeformer_core::types::{ImageSize, PoolingStride, SCALES};
+use placeformer_vision::extract::{ExtractConfig, HeadChoice, Precision, Preset};
 use std::path::PathBuf;
 
 /// The model and what it computes. What is left out is the preset's own.

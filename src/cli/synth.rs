@@ -1,9 +1,9 @@
 //! Render synthetic street scenes.
 
 use crate::cli::output::say;
-use placeformer_lab::synth::{Condition, DatasetOptions, image_count, write_dataset};
-use placeformer_core::types::ImageSize;
 use indicatif::{ProgressBar, ProgressStyle};
+use placeformer_core::types::ImageSize;
+use placeformer_lab::synth::{Condition, DatasetOptions, image_count, write_dataset};
 use std::path::PathBuf;
 
 /// Arguments of this subcommand.

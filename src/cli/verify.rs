@@ -27,7 +27,7 @@ pub fn run(args: VerifyArgs) -> anyhow::Result<()> {
         args.data.display()
     );
     let config = Config::load(args.config.as_deref(), &Overrides::default())?;
-    let store = super::serve::open_store(&args.data, &config.store)?;
+    let store = crate::server::open_store(&args.data, &config.store)?;
     let report = store.verify().context("the store cannot be read")?;
     if args.json {
         let damaged: Vec<_> = report

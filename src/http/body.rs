@@ -11,7 +11,6 @@
 use super::AppState;
 use super::limits::Held;
 use super::problem::ApiError;
-use placeformer_core::error::ErrorCode;
 use axum::body::{Body, HttpBody};
 use axum::extract::{FromRequest, Multipart, Query, Request};
 use axum::http::{HeaderMap, Uri, header};
@@ -19,6 +18,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
 use http_body_util::BodyExt;
+use placeformer_core::error::ErrorCode;
 use serde::Deserializer;
 use serde::de::{DeserializeOwned, MapAccess, Visitor};
 use serde_json::value::RawValue;

@@ -213,7 +213,8 @@ mod tests {
 
     #[test]
     fn the_calibration_is_one() {
-        let parsed: placeformer_core::types::Calibration = serde_json::from_value(calibration()).unwrap();
+        let parsed: placeformer_core::types::Calibration =
+            serde_json::from_value(calibration()).unwrap();
         assert_eq!(serde_json::to_value(parsed).unwrap(), calibration());
     }
 }

@@ -1,13 +1,13 @@
 //! How fast one caller may ask, and how many bytes of bodies are held at once.
 
 use super::config::AuthConfig;
-use placeformer_core::error::ErrorCode;
 use crate::http::problem::ApiError;
 use crate::ops::Metrics;
 use crate::ops::metrics::Rejection;
 use bytes::Bytes;
 use governor::clock::{Clock, DefaultClock};
 use governor::{DefaultDirectRateLimiter, DefaultKeyedRateLimiter, Quota, RateLimiter};
+use placeformer_core::error::ErrorCode;
 use std::collections::HashMap;
 use std::net::IpAddr;
 use std::num::NonZeroU32;

@@ -2,12 +2,12 @@
 
 use super::AppState;
 use super::problem::{self, ApiError};
-use placeformer_core::error::ErrorCode;
 use crate::ops::metrics::Rejection;
 use axum::extract::{MatchedPath, Request, State};
 use axum::http::{HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use placeformer_core::error::ErrorCode;
 use std::time::Instant;
 use tracing::Instrument;
 use uuid::Uuid;

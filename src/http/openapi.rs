@@ -2,8 +2,8 @@
 
 use super::problem::{PROBLEM_JSON, ProblemBody};
 use super::{examples, routes};
-use placeformer_core::error::ErrorCode;
 use crate::ops::Metrics;
+use placeformer_core::error::ErrorCode;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 use std::sync::LazyLock;

@@ -5,12 +5,12 @@
 //! whatever else answers with an error status (the router's 404 and 405, a panic) into the same
 //! shape.
 
-use placeformer_core::error::ErrorCode;
 use crate::pipeline::PipelineError;
-use placeformer_core::types::{InvalidName, InvalidValue};
 use axum::body::Body;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use placeformer_core::error::ErrorCode;
+use placeformer_core::types::{InvalidName, InvalidValue};
 use serde::Serialize;
 use std::time::Duration;
 use utoipa::ToSchema;

@@ -2,8 +2,8 @@
 
 use super::maps::Change;
 use super::{PipelineError, Service};
-use placeformer_store::{ReferencePatch, StoreError};
 use placeformer_core::types::{Calibration, MapName, Reference, ReferenceFields, ReferenceId};
+use placeformer_store::{ReferencePatch, StoreError};
 use std::sync::Arc;
 
 impl Service {

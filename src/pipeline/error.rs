@@ -1,10 +1,10 @@
 //! Why a request through the pipeline failed.
 
 use placeformer_core::error::ErrorCode;
+use placeformer_core::types::{ExternalId, InvalidValue, MapName, ModelId, RerankId};
+use placeformer_store::StoreError;
 use placeformer_vision::extract::ExtractError;
 use placeformer_vision::image::ImageError;
-use placeformer_store::StoreError;
-use placeformer_core::types::{ExternalId, InvalidValue, MapName, ModelId, RerankId};
 use std::time::Duration;
 
 /// Everything that can end a request early.

@@ -8,10 +8,10 @@
 use super::admission::Ticket;
 use super::blocking::{Panicked, blocking};
 use super::{DescriptorSource, PipelineError, Timings};
-use placeformer_vision::image::ImageConfig;
 use crate::ops::{Metrics, Stage};
-use placeformer_core::types::{Deadline, Descriptor, ImageTensor};
 use bytes::Bytes;
+use placeformer_core::types::{Deadline, Descriptor, ImageTensor};
+use placeformer_vision::image::ImageConfig;
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Instant;

@@ -4,13 +4,15 @@ use super::admission::Ticket;
 use super::blocking::blocking;
 use super::extraction::Purpose;
 use super::{PipelineError, Service, Timings};
-use placeformer_core::error::ErrorCode;
 use crate::ops::Stage;
 use crate::ops::metrics::Rejection;
-use placeformer_vision::search::IndexEntry;
-use placeformer_store::Inserted;
-use placeformer_core::types::{ContentHash, InvalidValue, MapName, NewReference, Reference, ReferenceFields};
 use bytes::Bytes;
+use placeformer_core::error::ErrorCode;
+use placeformer_core::types::{
+    ContentHash, InvalidValue, MapName, NewReference, Reference, ReferenceFields,
+};
+use placeformer_store::Inserted;
+use placeformer_vision::search::IndexEntry;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 

@@ -7,10 +7,10 @@
 //! meanwhile is noted, so that the new index can catch up.
 
 use super::PipelineError;
+use placeformer_core::types::{Calibration, Descriptor, GeoPoint, MapName, ModelId, ReferenceId};
+use placeformer_store::StoreError;
 use placeformer_vision::extract::Head;
 use placeformer_vision::search::{IndexEntry, MapIndex};
-use placeformer_store::StoreError;
-use placeformer_core::types::{Calibration, Descriptor, GeoPoint, MapName, ModelId, ReferenceId};
 use std::borrow::Cow;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};

@@ -4,9 +4,9 @@ use super::blocking::blocking;
 use super::extraction::Purpose;
 use super::{PipelineError, Service, Timings};
 use crate::ops::Stage;
-use placeformer_vision::rerank::CombinationMatch;
-use placeformer_core::types::{Deadline, ImageSize, MapName, ModelId, PackedPatches, ReferenceId};
 use bytes::Bytes;
+use placeformer_core::types::{Deadline, ImageSize, MapName, ModelId, PackedPatches, ReferenceId};
+use placeformer_vision::rerank::CombinationMatch;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 

@@ -39,4 +39,4 @@ pub use service::{Service, ServiceInfo};
 pub use source::DescriptorSource;
 pub use startup::Parts;
 pub use timings::Timings;
-pub use trust::{Verdict, built_in_calibration};
+pub use trust::Verdict;

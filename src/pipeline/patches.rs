@@ -1,8 +1,8 @@
 //! Key patches of candidates: a sized cache in front of the store.
 
 use crate::ops::Metrics;
-use placeformer_store::{PlaceStore, StoreError};
 use placeformer_core::types::{PackedPatches, ReferenceId};
+use placeformer_store::{PlaceStore, StoreError};
 use quick_cache::sync::Cache;
 use std::sync::Arc;
 

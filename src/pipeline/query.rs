@@ -5,16 +5,16 @@ use super::blocking::blocking;
 use super::extraction::Purpose;
 use super::maps::LiveMap;
 use super::{PipelineError, Service, Timings, Verdict};
-use placeformer_core::error::ErrorCode;
 use crate::ops::Stage;
 use crate::ops::metrics::Rejection;
-use placeformer_vision::rerank::{PairScore, Reranked};
-use placeformer_vision::search::Neighbour;
-use placeformer_store::StoreError;
+use bytes::Bytes;
+use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{
     Deadline, Descriptor, MapName, ModelId, Reference, ReferenceFilter, ReferenceId,
 };
-use bytes::Bytes;
+use placeformer_store::StoreError;
+use placeformer_vision::rerank::{PairScore, Reranked};
+use placeformer_vision::search::Neighbour;
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};

@@ -8,11 +8,11 @@
 use super::maps::{LiveMap, MapEntry, Projection};
 use super::startup::index_entry;
 use super::{PipelineError, Service};
+use bytes::Bytes;
+use placeformer_core::types::{MapName, ModelId};
+use placeformer_store::{GlobalRow, HeadExchange, MapInfo, NewHead, StoreError};
 use placeformer_vision::extract::{ExtractError, Head};
 use placeformer_vision::search::{IndexBuilder, MapIndex};
-use placeformer_store::{GlobalRow, HeadExchange, MapInfo, NewHead, StoreError};
-use placeformer_core::types::{MapName, ModelId};
-use bytes::Bytes;
 use rayon::prelude::*;
 use std::path::Path;
 use std::sync::{Arc, RwLockWriteGuard};

@@ -10,9 +10,11 @@ use super::{PipelineConfig, PipelineError};
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::metrics::MemoryComponent;
 use crate::ops::{Health, Metrics};
-use placeformer_vision::rerank::{RerankConfig, Reranker};
+use placeformer_core::types::{
+    Calibration, ExternalId, ImageSize, MapName, ModelId, Reference, ReferenceId,
+};
 use placeformer_store::{MapInfo, Page, PlaceStore, StoreError};
-use placeformer_core::types::{Calibration, ExternalId, ImageSize, MapName, ModelId, Reference, ReferenceId};
+use placeformer_vision::rerank::{RerankConfig, Reranker};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::Mutex;

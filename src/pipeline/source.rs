@@ -1,8 +1,8 @@
 //! The seam between the pipeline and the model, so that tests of the service need no weights.
 
+use placeformer_core::types::{Descriptor, ImageSize, ImageTensor, ModelId};
 use placeformer_vision::extract::{ExtractError, Extractor, Head};
 use placeformer_vision::image::{self, ImageConfig, ImageError};
-use placeformer_core::types::{Descriptor, ImageSize, ImageTensor, ModelId};
 
 /// What turns images into descriptors. Production uses [`Extractor`].
 pub trait DescriptorSource: Send + Sync + 'static {

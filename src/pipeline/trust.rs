@@ -4,23 +4,7 @@
 use super::PipelineError;
 use super::query::QueryResult;
 use placeformer_core::types::{Calibration, ConfidenceCurve, MapName, ModelId, RerankId};
-
-/// Calibrations that ship, one per model.
-const BUILT_IN: [&str; 1] = [include_str!(
-    "../../models/dinov2-vits14-b8.calibration.json"
-)];
-
-/// The calibration built in for `model`, if there is one.
-pub fn built_in_calibration(model: &ModelId) -> Option<Calibration> {
-    shipped().find(|calibration| calibration.model() == model)
-}
-
-fn shipped() -> impl Iterator<Item = Calibration> {
-    // A test reads every one of them, so none is left out here.
-    BUILT_IN
-        .iter()
-        .filter_map(|text| serde_json::from_str(text).ok())
-}
+use placeformer_models::built_in_calibrations;
 
 /// What can be said about the best answer.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -41,7 +25,7 @@ impl Trust {
     /// For a server that re-ranks as `rerank` says.
     pub(super) fn new(rerank: RerankId) -> Self {
         Self {
-            built_in: shipped().collect(),
+            built_in: built_in_calibrations().collect(),
             rerank,
         }
     }
@@ -126,9 +110,12 @@ impl Trust {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use placeformer_core::types::{
+        ConfidenceWeights, ContentHash, Reference, ReferenceFields, ReferenceId,
+    };
+    use placeformer_models::built_in_calibration;
     use placeformer_vision::extract::Head;
     use placeformer_vision::rerank::{PairScore, RerankConfig};
-    use placeformer_core::types::{ConfidenceWeights, ContentHash, Reference, ReferenceFields, ReferenceId};
     use time::OffsetDateTime;
 
     fn curve(bias: f64, score: f64) -> ConfidenceCurve {
@@ -186,8 +173,7 @@ mod tests {
 
     #[test]
     fn what_ships_can_be_read_and_holds_for_the_default_re_ranking() {
-        for text in BUILT_IN {
-            let shipped: Calibration = serde_json::from_str(text).unwrap();
+        for shipped in built_in_calibrations() {
             assert_eq!(built_in_calibration(shipped.model()), Some(shipped.clone()));
             assert_eq!(*shipped.rerank(), RerankConfig::default().id());
             // Whoever makes another head must fit another calibration, or the default model goes

@@ -1,8 +1,8 @@
 //! The program on a small drawn town, as a user would run it.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
-use placeformer_vision::extract::Preset;
 use placeformer_models::model_path;
+use placeformer_vision::extract::Preset;
 use std::path::Path;
 use std::process::{Command, Output};
 

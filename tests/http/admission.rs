@@ -3,9 +3,9 @@
 use crate::support::{Answer, App, FakeSource, picture};
 use axum::body::Body;
 use axum::http::Request;
-use placeformer_core::error::ErrorCode;
 use placeformer::http::{ApiKey, AppState, AuthConfig, HttpConfig, Role, app};
 use placeformer::ops::{Health, Metrics};
+use placeformer_core::error::ErrorCode;
 use sha2::Digest;
 use std::sync::Arc;
 use std::time::Duration;

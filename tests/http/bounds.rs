@@ -4,12 +4,12 @@
 use crate::support::{App, FakeSource, Gate, PATIENCE, multipart, picture, until};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
+use placeformer_core::types::{
+    Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
+};
 use placeformer_store::{
     Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined,
     ReferencePatch, SqliteStore, StoreError, VerifyReport,
-};
-use placeformer_core::types::{
-    Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
 };
 use serde_json::json;
 use std::path::Path;

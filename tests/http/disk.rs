@@ -3,9 +3,9 @@
 use crate::process::Server;
 use crate::small_disk::SmallDisk;
 use crate::support::{App, FakeSource, SIZE, picture};
-use placeformer_vision::image::{ImageConfig, load_tensor};
 use placeformer::pipeline::DescriptorSource;
 use placeformer_store::codec;
+use placeformer_vision::image::{ImageConfig, load_tensor};
 use serde_json::json;
 use std::path::Path;
 use std::time::{Duration, Instant};

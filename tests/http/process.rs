@@ -2,11 +2,11 @@
 //! serves.
 
 use crate::support::{BACKBONE, FakeSource, head};
-use placeformer::cli::serve::{Loaders, run_server};
 use placeformer::config::Config;
-use placeformer_vision::extract::Aggregate;
 use placeformer::ops::{LogConfig, LogFormat, logging};
+use placeformer::server::{Loaders, run_server};
 use placeformer_store::{SqliteStore, StoreConfig, crash_points};
+use placeformer_vision::extract::Aggregate;
 use serde_json::Value;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::ExitStatusExt;

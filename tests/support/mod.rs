@@ -2,22 +2,22 @@
 //! descriptor source that derives everything from the image's content.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
-use placeformer_vision::extract::pack;
 use axum::body::Body;
 use axum::http::{HeaderMap, Request, StatusCode};
 use axum::response::Response;
 use http_body_util::BodyExt;
 use placeformer::config::Config;
-use placeformer_vision::extract::{Aggregate, ExtractError, Head};
 use placeformer::http::{AppState, app};
-use placeformer_vision::image::{ImageConfig, ImageError, load_tensor};
 use placeformer::ops::{Health, Metrics};
 use placeformer::pipeline::{DescriptorSource, Parts, Service};
-use placeformer_store::{PlaceStore, SqliteStore, StoreConfig};
 use placeformer_core::types::{
-    Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid,
-    PoolingStride, ScaleKeyPatches,
+    Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, ModelId, PatchGrid, PoolingStride,
+    ScaleKeyPatches,
 };
+use placeformer_store::{PlaceStore, SqliteStore, StoreConfig};
+use placeformer_vision::extract::pack;
+use placeformer_vision::extract::{Aggregate, ExtractError, Head};
+use placeformer_vision::image::{ImageConfig, ImageError, load_tensor};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::Value;

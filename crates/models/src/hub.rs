@@ -6,8 +6,8 @@
 //! an old beginning.
 
 use super::PullError;
-use placeformer_core::files::{hash_file, with_suffix};
 use indicatif::ProgressBar;
+use placeformer_core::files::{hash_file, with_suffix};
 use reqwest::StatusCode;
 use reqwest::blocking::{Client, Response};
 use reqwest::header::{ACCEPT_ENCODING, CONTENT_LENGTH, ETAG, HeaderMap, LOCATION, RANGE};

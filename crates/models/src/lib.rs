@@ -5,16 +5,18 @@
 //! weights before it takes its place in the cache, with a [`Record`] of its origin and SHA-256
 //! beside it. A lock file lets two processes pull at once without spoiling each other's work.
 
+mod calibration;
 mod hub;
 mod onnx;
 mod wheel;
 
+pub use calibration::{built_in_calibration, built_in_calibrations};
+pub use hub::Hub;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use placeformer_core::files::{hash_file, rename_durably, with_suffix, write_atomically};
 use placeformer_vision::extract::{
     ExtractConfig, ExtractError, Extractor, Preset, Record, VitWeights, verify_weights,
 };
-pub use hub::Hub;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::path::{Path, PathBuf};
 use std::sync::Once;
 

@@ -23,9 +23,9 @@
 //! then the checksum, then every value's range: whatever the bytes, the outcome is a valid
 //! [`PackedPatches`] or an error.
 
-use placeformer_core::types::{PackedPatches, PatchGrid, PoolingStride, SCALES};
 use half::f16;
 use half::slice::HalfFloatSliceExt;
+use placeformer_core::types::{PackedPatches, PatchGrid, PoolingStride, SCALES};
 
 const MAGIC: [u8; 4] = *b"PFKP";
 const VERSION: u16 = 1;

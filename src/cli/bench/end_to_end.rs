@@ -1,18 +1,19 @@
 //! `POST /query` through a server process, over loopback.
 
 use super::peers::{Measured, Peers};
-use placeformer_lab::bench::filled::FilledStore;
-use placeformer_lab::bench::{fill_with_streets, scenes::street, street_map};
 use crate::cli::child_server::ChildServer;
 use crate::cli::client::resident_bytes;
 use crate::cli::output::say;
-use crate::cli::serve::{Loaders, open_model, serve_until_signal};
+use crate::cli::serve::print_address;
 use crate::config::Config;
-use placeformer_vision::extract::{ExtractConfig, Extractor};
-use placeformer_store::{SqliteStore, StoreConfig};
-use placeformer_core::types::ImageSize;
+use crate::server::{Loaders, open_model, serve_until_signal};
 use anyhow::{Context, ensure};
 use hdrhistogram::Histogram;
+use placeformer_core::types::ImageSize;
+use placeformer_lab::bench::filled::FilledStore;
+use placeformer_lab::bench::{fill_with_streets, scenes::street, street_map};
+use placeformer_store::{SqliteStore, StoreConfig};
+use placeformer_vision::extract::{ExtractConfig, Extractor};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -160,7 +161,8 @@ pub(super) fn serve_filled(
             )?))
         }),
     };
-    serve_until_signal(config, loaders)
+    serve_until_signal(config, loaders, print_address)?;
+    Ok(())
 }
 
 /// Answers of one measurement.

@@ -2,18 +2,19 @@
 
 mod end_to_end;
 mod peers;
+mod service;
 mod table;
 
 use super::model_args::ModelOptions;
-use placeformer_lab::bench::{Bench, BenchError, Limits, NAMES, Row};
 use crate::cli::output::say;
-use placeformer_models::resolve_weights;
-use placeformer_vision::extract::{ExtractError, Extractor, VitWeights};
-use placeformer_kernels;
 use anyhow::{Context, ensure};
 use end_to_end::{EndToEnd, EndToEndRow};
 use indicatif::{ProgressBar, ProgressStyle};
+use placeformer_lab::bench::{Bench, BenchError, Limits, NAMES, Row};
+use placeformer_models::resolve_weights;
+use placeformer_vision::extract::{ExtractError, Extractor, VitWeights};
 use serde::Serialize;
+use service::PipelineServices;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -82,7 +83,7 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
             "warning: this is a development build; its times mean nothing (cargo build --release)"
         );
     }
-    let simd = kernels::self_check()?;
+    let simd = placeformer_kernels::self_check()?;
     if let (Some(extra), Some(folder)) = (args.serve_filled, &args.folder_of_filled) {
         return end_to_end::serve_filled(folder, extra, args.model.extract_config()?);
     }
@@ -122,6 +123,7 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
             limits,
             folder,
             rounds: args.rounds as usize,
+            services: &PipelineServices,
         };
         report.rows = rows(&bench, &args.only)?;
     }

@@ -1,9 +1,9 @@
 //! The same query as users assemble it today, from a script beside the benches, in the same run.
 
+use anyhow::{Context, ensure};
+use placeformer_core::types::ImageSize;
 use placeformer_lab::bench::scenes::street;
 use placeformer_vision::extract::Extractor;
-use placeformer_core::types::ImageSize;
-use anyhow::{Context, ensure};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -1,11 +1,11 @@
 //! What the demo showed: a table on the terminal, a page with pictures.
 
 use crate::cli::output::{OutputError, say};
+use anyhow::Context;
+use placeformer_core::geography::UtmName;
 use placeformer_lab::draw::{jpeg_data_uri, thumbnail};
-use placeformer_lab::datasets::UtmName;
 use placeformer_lab::eval::report::{escape, page, table};
 use placeformer_vision::image::{ImageConfig, decode};
-use anyhow::Context;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

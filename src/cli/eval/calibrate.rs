@@ -4,10 +4,10 @@ use super::{CacheArgs, DataArgs, Described, RerankArgs, write};
 use crate::cli::client::{ServerArgs, ServerClient};
 use crate::cli::model_args::ModelOptions;
 use crate::cli::output::say_part;
+use anyhow::{Context, ensure};
+use placeformer_core::types::{Calibration, MapName};
 use placeformer_lab::eval::calibrate::{BestAnswers, LeaveOut, OwnPlaces, Purpose, calibrate};
 use placeformer_lab::eval::features::GlobalKind;
-use placeformer_core::types::{Calibration, MapName};
-use anyhow::{Context, ensure};
 use std::path::PathBuf;
 
 /// Arguments of this subcommand.

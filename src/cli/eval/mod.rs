@@ -5,20 +5,23 @@ mod calibrate;
 use super::data_args::ReadArgs;
 use super::model_args::ModelOptions;
 use crate::cli::output::say_part;
+use anyhow::{Context, bail, ensure};
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use placeformer_core::types::{Calibration, ModelId, ScaleSet};
+use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions};
 use placeformer_lab::eval::ablate::{Ablation, Base, ablate};
 use placeformer_lab::eval::calibrate::{LeaveOut, OwnPlaces};
-use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions};
-use placeformer_lab::eval::features::{Describe, FeatureCache, Features, GlobalKind, ModelDescriber};
+use placeformer_lab::eval::features::{
+    Describe, FeatureCache, Features, GlobalKind, ModelDescriber,
+};
 use placeformer_lab::eval::report::{Painter, gallery};
 use placeformer_lab::eval::run::{Answer, QuerySeconds, rerank_all, search_all};
 use placeformer_lab::eval::summary::{Asked, RunConfig, Summary, summarise};
 use placeformer_lab::eval::{EvalError, prediction, report};
+use placeformer_models::open_extractor;
 use placeformer_vision::extract::{ExtractConfig, Extractor, Preset};
 use placeformer_vision::image::ImageConfig;
 use placeformer_vision::rerank::{RerankConfig, Reranker};
-use placeformer_core::types::{Calibration, ModelId, ScaleSet};
-use anyhow::{Context, bail, ensure};
-use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "Examples:
@@ -336,7 +339,7 @@ struct Answered {
 
 fn describer(config: &ExtractConfig) -> anyhow::Result<ModelDescriber> {
     Ok(ModelDescriber {
-        extractor: Extractor::open(config)?,
+        extractor: open_extractor(config)?,
         limits: ImageConfig::default(),
     })
 }

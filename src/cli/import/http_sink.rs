@@ -2,8 +2,8 @@
 //! request.
 
 use super::sink::{Outcome, Sent, Sink, UNREACHABLE, Upload};
-use placeformer_core::types::MapName;
 use anyhow::{Context, bail};
+use placeformer_core::types::MapName;
 use rand::RngExt;
 use reqwest::StatusCode;
 use reqwest::blocking::{Client, RequestBuilder, Response};

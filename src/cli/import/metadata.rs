@@ -3,10 +3,10 @@
 //!
 //! Each field is taken from the first source that has it.
 
-use placeformer_lab::datasets::{UtmName, UtmZone};
-use placeformer_vision::image::read_exif;
-use placeformer_core::types::{ExternalId, GeoPoint, Heading, ReferenceFields};
 use anyhow::{Context, anyhow, bail, ensure};
+use placeformer_core::geography::{UtmName, UtmZone};
+use placeformer_core::types::{ExternalId, GeoPoint, Heading, ReferenceFields};
+use placeformer_vision::image::read_exif;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 use time::OffsetDateTime;

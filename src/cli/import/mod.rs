@@ -13,11 +13,12 @@ mod verdict;
 
 use crate::cli::output::say;
 use crate::config::ModelOverrides;
-use placeformer_lab::datasets::{UtmZone, list_images};
-use placeformer_core::types::{ContentHash, ExternalId, MapName};
 use anyhow::{Context, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use metadata::Metadata;
+use placeformer_core::folder::list_images;
+use placeformer_core::geography::UtmZone;
+use placeformer_core::types::{ContentHash, ExternalId, MapName};
 use sink::{Outcome, Sink, Upload};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};

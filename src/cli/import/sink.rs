@@ -1,8 +1,8 @@
 //! Where an import puts its photos.
 
+use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{MapName, ReferenceFields};
-use bytes::Bytes;
 use std::collections::HashMap;
 
 /// A photo on its way.

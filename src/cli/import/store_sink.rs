@@ -2,13 +2,13 @@
 
 use super::sink::{Outcome, Sent, Sink, Upload};
 use crate::config::{Config, ModelOverrides, Overrides};
-use placeformer_core::error::ErrorCode;
-use placeformer_vision::extract::Extractor;
 use crate::ops::{Health, Metrics};
 use crate::pipeline::{IngestRequest, Parts, PipelineError, Service};
-use placeformer_store::SqliteStore;
-use placeformer_core::types::{MapName, ReferenceId};
 use anyhow::Context;
+use placeformer_core::error::ErrorCode;
+use placeformer_core::types::{MapName, ReferenceId};
+use placeformer_models::open_extractor;
+use placeformer_store::SqliteStore;
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -38,7 +38,7 @@ impl StoreSink {
         };
         let config = Config::load(config, &overrides)?;
         placeformer_kernels::self_check()?;
-        let extractor = Extractor::open(&config.extract).context("cannot load the model")?;
+        let extractor = open_extractor(&config.extract).context("cannot load the model")?;
         let store = SqliteStore::open(data, &config.store)?;
         let service = Service::start(Parts {
             store: Arc::new(store),

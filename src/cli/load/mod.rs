@@ -9,10 +9,10 @@ mod client;
 mod report;
 
 use crate::cli::output::say;
-use placeformer_lab::datasets::list_images;
 use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
 use client::{Outcome, Target};
+use placeformer_core::folder::list_images;
 use report::{Bounds, Report, Tally};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

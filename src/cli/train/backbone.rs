@@ -3,13 +3,16 @@
 use super::head::{Source, fit};
 use super::{RunArgs, bar, facts, finish, notes, show};
 use crate::cli::output::say;
-use placeformer_models::resolve_weights;
-use placeformer_vision::extract::{Aggregate, ExtractConfig, Extractor, Head, HeadChoice, VitWeights};
-use placeformer_vision::image::ImageConfig;
+use anyhow::ensure;
 use placeformer_lab::train::{
     Augmentation, BackboneModel, Progress, Session, TrainError, TrainableBlocks, TripletSet,
 };
-use anyhow::ensure;
+use placeformer_models::open_extractor;
+use placeformer_models::resolve_weights;
+use placeformer_vision::extract::{
+    Aggregate, ExtractConfig, Extractor, Head, HeadChoice, VitWeights,
+};
+use placeformer_vision::image::ImageConfig;
 
 pub(super) fn train(
     args: &RunArgs,
@@ -87,7 +90,7 @@ fn starting_head(
     extract: &ExtractConfig,
     training: &TripletSet,
 ) -> anyhow::Result<Head> {
-    let extractor = Extractor::open(extract)?;
+    let extractor = open_extractor(extract)?;
     match extractor.head() {
         Some(head) => Ok(head.clone()),
         None => {

@@ -1,9 +1,10 @@
 //! What is learnt from and what is held out, from the flags.
 
 use crate::cli::data_args::ReadArgs;
-use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions, Split, list_images};
-use placeformer_lab::train::{Holdout, TripletSet};
 use anyhow::{Context, bail, ensure};
+use placeformer_core::folder::list_images;
+use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions, Split};
+use placeformer_lab::train::{Holdout, TripletSet};
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 

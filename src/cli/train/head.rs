@@ -1,12 +1,15 @@
 //! Training the head alone, on pooled tokens.
 
 use super::{HeadTrainArgs, RunArgs, bar, facts, finish, notes, show};
-use placeformer_vision::extract::{Covariance, Extractor, Head, HeadChoice, half_whitened_head_of_few};
+use anyhow::Context;
+use indicatif::{ProgressBar, ProgressStyle};
 use placeformer_lab::train::{
     Augmentation, HeadModel, PooledCache, PooledTokens, Progress, Session, Side, TripletSet,
 };
-use anyhow::Context;
-use indicatif::{ProgressBar, ProgressStyle};
+use placeformer_models::open_extractor;
+use placeformer_vision::extract::{
+    Covariance, Extractor, Head, HeadChoice, half_whitened_head_of_few,
+};
 use std::collections::HashSet;
 
 /// Runs `head train`.
@@ -20,7 +23,7 @@ pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
     let sides = args.data.load(args.method.seed)?;
     eprintln!("{}", sides.description);
     let extract = args.model.extract_config()?;
-    let extractor = Extractor::open(&extract)?;
+    let extractor = open_extractor(&extract)?;
     let mut source = Source::open(args, &extractor)?;
     let training = source.tokens(&sides.training)?;
     let validation = source.tokens(&sides.validation)?;

@@ -10,13 +10,13 @@ mod head;
 
 use super::model_args::ModelOptions;
 use crate::cli::output::say;
-use placeformer_lab::train::{
-    Augmentation, Outcome, Progress, Schedule, TrainConfig, TrainableBlocks, read_log, report,
-};
 use anyhow::{Context, ensure};
 use clap::Args;
 use data::TrainData;
 use indicatif::{ProgressBar, ProgressStyle};
+use placeformer_lab::train::{
+    Augmentation, Outcome, Progress, Schedule, TrainConfig, TrainableBlocks, read_log, report,
+};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;

@@ -3,9 +3,9 @@
 use super::match_images::SizeBody;
 use crate::http::AppState;
 use crate::http::problem::ApiError;
-use placeformer_core::types::Calibration;
 use axum::Json;
 use axum::extract::State;
+use placeformer_core::types::Calibration;
 use serde::Serialize;
 use utoipa::ToSchema;
 

@@ -1,14 +1,14 @@
 //! `/maps`: sets of references that are searched together.
 
-use placeformer_core::error::ErrorCode;
 use crate::http::AppState;
 use crate::http::body::{read_file, read_json};
 use crate::http::problem::ApiError;
-use placeformer_store::MapInfo;
-use placeformer_core::types::{Calibration, MapName};
 use axum::Json;
 use axum::extract::{Path, Request, State};
 use axum::http::StatusCode;
+use placeformer_core::error::ErrorCode;
+use placeformer_core::types::{Calibration, MapName};
+use placeformer_store::MapInfo;
 use serde::Serialize;
 use time::OffsetDateTime;
 use utoipa::ToSchema;

@@ -1,6 +1,5 @@
 //! `/livez`, `/readyz`, `/metrics`: for supervisors, balancers and Prometheus.
 
-use placeformer_core::error::ErrorCode;
 use crate::http::AppState;
 use crate::http::body::read_query;
 use crate::http::problem::{ApiError, OwnBody};
@@ -9,6 +8,7 @@ use axum::extract::State;
 use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
+use placeformer_core::error::ErrorCode;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 

@@ -1,17 +1,17 @@
 //! `/references`: the photos that make up the maps.
 
 use super::shapes::{ReferenceBody, json_object, point, present, timed};
-use placeformer_core::error::ErrorCode;
 use crate::http::AppState;
 use crate::http::body::{read_json, read_query, read_upload};
 use crate::http::problem::ApiError;
 use crate::pipeline::IngestRequest;
-use placeformer_store::ReferencePatch;
-use placeformer_core::types::{ExternalId, Heading, MapName, ReferenceFields, ReferenceId};
 use axum::Json;
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderValue, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
+use placeformer_core::error::ErrorCode;
+use placeformer_core::types::{ExternalId, Heading, MapName, ReferenceFields, ReferenceId};
+use placeformer_store::ReferencePatch;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use time::OffsetDateTime;

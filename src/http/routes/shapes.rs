@@ -2,10 +2,10 @@
 
 use crate::http::problem::ApiError;
 use crate::pipeline::Timings;
-use placeformer_core::types::{GeoPoint, Heading, Reference};
 use axum::Json;
 use axum::http::{HeaderName, HeaderValue};
 use axum::response::{IntoResponse, Response};
+use placeformer_core::types::{GeoPoint, Heading, Reference};
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;

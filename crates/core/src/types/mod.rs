@@ -6,13 +6,13 @@ mod descriptor;
 mod ids;
 mod reference;
 
+pub use crate::geography::{GeoCircle, GeoPoint, Heading};
 pub use calibration::{Calibration, ConfidenceCurve, ConfidenceWeights};
 pub use deadline::Deadline;
 pub use descriptor::{
     Descriptor, GLOBAL_DIM, ImageSize, ImageTensor, KeyPatches, PackedPatches, PatchGrid,
     PoolingStride, SCALES, ScaleKeyPatches, ScaleSet,
 };
-pub use crate::geography::{GeoCircle, GeoPoint, Heading};
 pub use ids::{ContentHash, ExternalId, InvalidName, MapName, ModelId, ReferenceId, RerankId};
 pub use reference::{NewReference, Reference, ReferenceFields, ReferenceFilter};
 

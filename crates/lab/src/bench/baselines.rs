@@ -1,11 +1,11 @@
 //! What one would write first: correct, parallel, and without a kernel of its own.
 
 use super::scenes::RerankScene;
-use placeformer_vision::image::{DEVIATION, MEAN};
-use placeformer_core::types::{GLOBAL_DIM, ImageSize, KeyPatches, ScaleSet};
 use candle_core::{Device, Tensor};
 use image::imageops::FilterType;
 use nalgebra::{SMatrix, SVector};
+use placeformer_core::types::{GLOBAL_DIM, ImageSize, KeyPatches, ScaleSet};
+use placeformer_vision::image::{DEVIATION, MEAN};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;

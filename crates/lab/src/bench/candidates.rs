@@ -1,16 +1,16 @@
 //! The rows of a query's candidates: loading their key patches from a store, and re-ranking them.
 
-use placeformer_vision::extract::pack;
 use super::measure::paired;
 use super::scenes::{RerankScene, unit_vector};
 use super::stages::{Bench, BenchError, agree};
 use super::{Limits, Row, baselines};
-use placeformer_vision::rerank::{RerankConfig, Reranked, Reranker};
-use placeformer_store::{Inserted, PlaceStore, SqliteStore, StoreConfig};
 use placeformer_core::types::{
     ContentHash, Descriptor, KeyPatches, MapName, ModelId, NewReference, PackedPatches,
     ReferenceFields, ReferenceId, SCALES, ScaleKeyPatches, ScaleSet,
 };
+use placeformer_store::{Inserted, PlaceStore, SqliteStore, StoreConfig};
+use placeformer_vision::extract::pack;
+use placeformer_vision::rerank::{RerankConfig, Reranked, Reranker};
 use rayon::prelude::*;
 use std::path::Path;
 
@@ -114,7 +114,7 @@ impl Limits {
     }
 }
 
-impl Bench {
+impl Bench<'_> {
     /// Key patches from a store whose pages are in the system's cache, decoded.
     pub(super) fn load(&self) -> Result<Row, BenchError> {
         let (store, ids) = self.store_of_streets()?;

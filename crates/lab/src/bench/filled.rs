@@ -5,12 +5,12 @@
 //! real ones; should one be asked for after all, it lends the patches of a real reference.
 
 use super::scenes::index_entry;
+use placeformer_core::types::{
+    Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
+};
 use placeformer_store::{
     Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined,
     ReferencePatch, StoreError, VerifyReport,
-};
-use placeformer_core::types::{
-    Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
 };
 use rayon::prelude::*;
 use std::path::Path;
@@ -181,10 +181,10 @@ impl<S: PlaceStore> PlaceStore for FilledStore<S> {
 mod tests {
     use super::*;
     use crate::bench::scenes::made_up_id;
-    use placeformer_store::{SqliteStore, StoreConfig};
     use placeformer_core::types::{
         ContentHash, Descriptor, GLOBAL_DIM, ModelId, PatchGrid, PoolingStride, ReferenceFields,
     };
+    use placeformer_store::{SqliteStore, StoreConfig};
 
     fn reference(map: &MapName) -> NewReference {
         let grid = PatchGrid {

@@ -1,23 +1,19 @@
 //! The rows of taking references in: all stages of an import, and the commit alone.
 
-use placeformer_vision::extract::pack;
 use super::Row;
 use super::measure::in_turn;
 use super::scenes::{RerankScene, street, unit_vector};
 use super::stages::{Bench, BenchError, REFERENCE_SIZE, street_map};
-use placeformer_vision::image::{ImageConfig, load_tensor};
-use crate::pipeline::{IngestRequest, PipelineError, Service};
-use placeformer_store::{PlaceStore, SqliteStore, StoreConfig, StoreError};
-use placeformer_core::types::{
-    ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, NewReference, PackedPatches,
-    ReferenceFields,
-};
 use bytes::Bytes;
-use futures_util::{StreamExt, TryStreamExt, stream};
+use placeformer_core::types::{
+    ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, NewReference, ReferenceFields,
+};
+use placeformer_store::{PlaceStore, SqliteStore, StoreConfig, StoreError};
+use placeformer_vision::extract::pack;
+use placeformer_vision::image::{ImageConfig, load_tensor};
 use std::fs::File;
 use std::io::Write;
 use std::path::Path;
-use std::sync::Arc;
 
 /// Photos of one run.
 const PHOTOS: u64 = 16;
@@ -28,7 +24,7 @@ const COMMITS: usize = 64;
 /// Writers that wait for their own commits at once.
 const WRITERS: usize = 16;
 
-impl Bench {
+impl Bench<'_> {
     /// Milliseconds a photo until it is durable and can be found, as `import` sends them; the
     /// baseline takes one after the other through the same stages. The limit is extraction alone:
     /// what overlaps it costs nothing.
@@ -36,8 +32,6 @@ impl Bench {
         let photos = (0..PHOTOS)
             .map(|place| street(place, 2, REFERENCE_SIZE).map(Bytes::from))
             .collect::<Result<Vec<_>, _>>()?;
-        let runtime =
-            tokio::runtime::Runtime::new().map_err(|error| BenchError::Setup(error.to_string()))?;
         let store = SqliteStore::open(&self.new_folder("ingest")?, &StoreConfig::default())?;
         let service = self.service(store, 0)?;
         let plain =
@@ -49,7 +43,11 @@ impl Bench {
         let [ours, plain, extraction] = in_turn(
             self.rounds,
             [
-                &mut || Ok(runtime.block_on(take_in(&service, &photos))?),
+                &mut || {
+                    service
+                        .ingest(&street_map(), &photos, UNDER_WAY)
+                        .map_err(BenchError::Service)
+                },
                 &mut || self.one_by_one(&plain, &photos),
                 &mut || {
                     Ok(tensors
@@ -119,23 +117,6 @@ impl Bench {
         .map(|ms| ms / COMMITS as f64);
         Row::new("commit", "a sync for each reference", (ours, plain), limit)
     }
-}
-
-async fn take_in(service: &Arc<Service>, photos: &[Bytes]) -> Result<(), PipelineError> {
-    let ingest = |image: Bytes| async move {
-        service
-            .ingest(IngestRequest {
-                map: street_map(),
-                fields: ReferenceFields::default(),
-                image,
-            })
-            .await
-    };
-    stream::iter(photos.iter().cloned())
-        .map(ingest)
-        .buffer_unordered(UNDER_WAY)
-        .try_for_each(|_| async { Ok(()) })
-        .await
 }
 
 fn insert_at_once(store: &SqliteStore, news: &[NewReference]) -> Result<(), StoreError> {

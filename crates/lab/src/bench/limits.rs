@@ -1,7 +1,7 @@
 //! What this machine reaches at most, on all threads at once.
 
-use placeformer_vision::extract::mixed_int8_blocks;
 use placeformer_kernels::{Simd, peak};
+use placeformer_vision::extract::mixed_int8_blocks;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::hint::black_box;

@@ -20,10 +20,12 @@ mod limits;
 mod measure;
 mod rehead;
 pub mod scenes;
+mod service;
 mod stages;
 
 pub use candidates::store_scene;
 pub use limits::Limits;
+pub use service::{MeasuredService, ServiceError, StartService};
 pub use stages::{Bench, BenchError, NAMES, REFERENCE_SIZE, fill_with_streets, street_map};
 
 use serde::Serialize;

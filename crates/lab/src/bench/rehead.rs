@@ -1,17 +1,17 @@
 //! The row of giving a map another head.
 
-use placeformer_vision::extract::pack;
 use super::Row;
 use super::ingest::{new_reference, write_and_sync};
 use super::measure::in_turn;
 use super::scenes::{street, unit_vector};
 use super::stages::{Bench, BenchError, REFERENCE_SIZE, street_map};
-use placeformer_vision::extract::Head;
-use placeformer_store::{HeadExchange, Inserted, NewHead, PlaceStore, SqliteStore, StoreConfig};
 use placeformer_core::types::{
-    ContentHash, Descriptor, GLOBAL_DIM, KeyPatches, ModelId, PackedPatches, PatchGrid,
-    PoolingStride, ScaleKeyPatches,
+    ContentHash, Descriptor, GLOBAL_DIM, KeyPatches, ModelId, PatchGrid, PoolingStride,
+    ScaleKeyPatches,
 };
+use placeformer_store::{HeadExchange, Inserted, NewHead, PlaceStore, SqliteStore, StoreConfig};
+use placeformer_vision::extract::Head;
+use placeformer_vision::extract::pack;
 use rayon::prelude::*;
 
 /// References of the map.
@@ -19,7 +19,7 @@ const REFERENCES: u64 = 100_000;
 /// References stored at once.
 const BATCH: usize = 1_000;
 
-impl Bench {
+impl Bench<'_> {
     /// Milliseconds until all vectors of a map come from another head, as `map rehead` does it; the
     /// baseline describes the map's images again, of which one is measured. The limit is one file
     /// of the same vectors, synced once.

@@ -1,12 +1,12 @@
 //! Inputs of the benchmarks, the same at every run.
 
-use placeformer_vision::image::{ImageError, encode_jpeg};
-use placeformer_vision::search::IndexEntry;
 use crate::synth::{Condition, StreetWorld, Viewpoint};
 use placeformer_core::types::{
     GLOBAL_DIM, GeoPoint, ImageSize, KeyPatches, PatchGrid, PoolingStride, ReferenceId,
     ScaleKeyPatches,
 };
+use placeformer_vision::image::{ImageError, encode_jpeg};
+use placeformer_vision::search::IndexEntry;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

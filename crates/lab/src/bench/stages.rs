@@ -5,23 +5,21 @@ use super::filled::FilledStore;
 use super::limits::Limits;
 use super::measure::{median, paired};
 use super::scenes::{CANDIDATES, PHOTO_SIZE, RerankScene, index_entry, photo, street, unit_vector};
+use super::service::{MeasuredService, ServiceError, StartService};
 use super::{Row, baselines};
+use bytes::Bytes;
+use placeformer_core::types::{
+    ContentHash, ImageSize, ImageTensor, MapName, NewReference, ReferenceFields, ReferenceFilter,
+    ReferenceId,
+};
+use placeformer_kernels::scan::ROW_BYTES;
+use placeformer_store::{Inserted, PlaceStore, SqliteStore, StoreConfig, StoreError};
 use placeformer_vision::extract::{
     CandleEncoder, Encoder, EncoderSpec, ExtractError, Extractor, Geometry, Precision, VitWeights,
     build_encoder,
 };
 use placeformer_vision::image::{ImageConfig, ImageError, load_tensor};
-use placeformer_kernels::scan::ROW_BYTES;
-use crate::ops::{Health, Metrics};
-use crate::pipeline::{Parts, PipelineConfig, PipelineError, QueryOptions, QueryRequest, Service};
-use placeformer_vision::rerank::RerankConfig;
 use placeformer_vision::search::{IndexEntry, MapIndex};
-use placeformer_store::{Inserted, PlaceStore, SqliteStore, StoreConfig, StoreError};
-use placeformer_core::types::{
-    ContentHash, ImageSize, ImageTensor, MapName, NewReference, ReferenceFields, ReferenceFilter,
-    ReferenceId,
-};
-use bytes::Bytes;
 use rayon::prelude::*;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -107,9 +105,9 @@ pub enum BenchError {
     /// From the store.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// From the pipeline.
-    #[error(transparent)]
-    Pipeline(#[from] PipelineError),
+    /// From the whole service.
+    #[error("the service: {0}")]
+    Service(ServiceError),
     /// Working files could not be kept.
     #[error("cannot use {}: {source}", path.display())]
     Io {
@@ -124,7 +122,7 @@ pub enum BenchError {
 }
 
 /// Everything a run needs.
-pub struct Bench {
+pub struct Bench<'a> {
     /// The model with its head.
     pub extractor: Arc<Extractor>,
     /// The same weights, for the baseline and for batches.
@@ -137,9 +135,11 @@ pub struct Bench {
     pub folder: PathBuf,
     /// Paired runs of a row that takes long; short rows take more.
     pub rounds: usize,
+    /// Starts the service of the rows that measure all of it.
+    pub services: &'a dyn StartService,
 }
 
-impl Bench {
+impl Bench<'_> {
     /// Measures one row.
     ///
     /// # Errors
@@ -295,8 +295,6 @@ impl Bench {
     /// A photo through the whole service at a million references, against the sum of the plain
     /// stages.
     fn query(&self) -> Result<Row, BenchError> {
-        let setup = |error: &dyn std::fmt::Display| BenchError::Setup(error.to_string());
-        let runtime = tokio::runtime::Runtime::new().map_err(|error| setup(&error))?;
         let (store, ids) = self.store_of_streets()?;
         let photo = Bytes::from(photo()?);
         // What the service will compare the photo with: random vectors are far from it, so that the
@@ -304,16 +302,9 @@ impl Bench {
         let scene = self.scene_of(&photo, &store, &ids)?;
         let service = self.service(store, QUERY_REFERENCES - ids.len() as u64)?;
         let map: MapName = street_map();
-        let ours = || {
-            let request = QueryRequest {
-                map: map.clone(),
-                image: photo.clone(),
-                options: QueryOptions::default(),
-            };
-            runtime.block_on(service.query(request))
-        };
-        let answer = ours()?;
-        agree("query_1m", answer.reranked, || {
+        let ours = || service.query(&map, &photo);
+        let reranked = ours().map_err(BenchError::Service)?;
+        agree("query_1m", reranked, || {
             "the answer was not re-ranked".into()
         })?;
         let vectors: Vec<f32> = (0..QUERY_REFERENCES)
@@ -383,20 +374,11 @@ impl Bench {
         &self,
         store: SqliteStore,
         extra: u64,
-    ) -> Result<Arc<Service>, BenchError> {
-        let metrics = Metrics::new().map_err(|error| BenchError::Setup(error.to_string()))?;
-        Ok(Service::start(Parts {
-            store: Arc::new(FilledStore::new(store, extra)?),
-            source: self.extractor.clone(),
-            image: ImageConfig::default(),
-            rerank: RerankConfig::default(),
-            pipeline: PipelineConfig {
-                deadline_ms: 600_000,
-                ..PipelineConfig::default()
-            },
-            metrics: Arc::new(metrics),
-            health: Arc::new(Health::default()),
-        })?)
+    ) -> Result<Box<dyn MeasuredService>, BenchError> {
+        let store = FilledStore::new(store, extra)?;
+        self.services
+            .start(store, self.extractor.clone())
+            .map_err(BenchError::Service)
     }
 
     /// A store with a map of [`CANDIDATES`] drawn streets, made at the first call.

@@ -1,6 +1,6 @@
 //! Checks that a data set lies on disk as its reader expects.
 
-use crate::eval::EvalError;
+use super::DatasetError;
 use std::path::PathBuf;
 
 /// The folder, or an error that says what the layout should be.
@@ -8,11 +8,11 @@ pub(super) fn require(
     dataset: &'static str,
     path: PathBuf,
     expected: &'static str,
-) -> Result<PathBuf, EvalError> {
+) -> Result<PathBuf, DatasetError> {
     if path.exists() {
         Ok(path)
     } else {
-        Err(EvalError::Layout {
+        Err(DatasetError::Layout {
             dataset,
             path,
             expected,

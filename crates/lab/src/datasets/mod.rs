@@ -4,6 +4,7 @@
 //! [`Truth`]. What a reader leaves out (panoramas, rows without a position) it lists in `skipped`;
 //! what it had to decide it says in `notes`; nothing is dropped in silence.
 
+mod error;
 mod layout;
 mod msls;
 mod neighbours;
@@ -15,11 +16,11 @@ mod table;
 mod utm;
 mod zones;
 
+pub use error::DatasetError;
 pub use neighbours::NeighbourGrid;
 pub use pairs::load_pairs;
 pub use robotcar::Pose;
 
-use crate::eval::EvalError;
 use placeformer_core::geography::MetricPoint;
 use std::path::{Path, PathBuf};
 
@@ -115,7 +116,7 @@ pub struct Dataset {
 
 impl Dataset {
     /// Refuses a data set with an empty side; checks that every query has its truth.
-    fn checked(self, root: &Path) -> Result<Self, EvalError> {
+    fn checked(self, root: &Path) -> Result<Self, DatasetError> {
         debug_assert_eq!(self.queries.len(), self.truth.len());
         for (side, items) in [("database", &self.database), ("query", &self.queries)] {
             if items.is_empty() {
@@ -130,7 +131,7 @@ impl Dataset {
                     }
                     None => String::new(),
                 };
-                return Err(EvalError::Empty {
+                return Err(DatasetError::Empty {
                     dataset: self.name,
                     side,
                     path: root.to_owned(),
@@ -236,15 +237,15 @@ impl DatasetOptions {
     ///
     /// # Errors
     /// The radius or the view angle is.
-    pub fn check(&self) -> Result<(), EvalError> {
+    pub fn check(&self) -> Result<(), DatasetError> {
         if !(self.radius_m.is_finite() && self.radius_m > 0.0) {
-            return Err(EvalError::Setting(format!(
+            return Err(DatasetError::Setting(format!(
                 "the radius must be a positive number of metres, not {}",
                 self.radius_m
             )));
         }
         match self.max_angle_deg {
-            Some(angle) if !(0.0..=180.0).contains(&angle) => Err(EvalError::Setting(format!(
+            Some(angle) if !(0.0..=180.0).contains(&angle) => Err(DatasetError::Setting(format!(
                 "the view angle must be 0 to 180 degrees, not {angle}"
             ))),
             _ => Ok(()),
@@ -257,7 +258,7 @@ pub fn load(
     kind: DatasetKind,
     root: &Path,
     options: &DatasetOptions,
-) -> Result<Dataset, EvalError> {
+) -> Result<Dataset, DatasetError> {
     options.check()?;
     let dataset = match kind {
         DatasetKind::MslsVal => msls::load_labelled(root, options)?,

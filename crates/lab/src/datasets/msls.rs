@@ -8,11 +8,13 @@
 //! 40-degree view-angle rule (paper IV) uses the compass angle `ca` of `raw.csv`; the official
 //! image-to-image script for the validation cities measures the distance only (give 180 for that).
 
-use super::files::{list_images, require};
+use super::DatasetError;
+use super::layout::require;
 use super::neighbours::truth_by_distance;
 use super::table::Table;
-use super::{Dataset, DatasetOptions, Item, MetricPoint, Skipped, Split, Truth, utm};
-use crate::eval::EvalError;
+use super::{Dataset, DatasetOptions, Item, Skipped, Split, Truth, utm};
+use placeformer_core::folder::list_images;
+use placeformer_core::geography::MetricPoint;
 use std::collections::hash_map::Entry;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
@@ -32,7 +34,10 @@ const TEST_CITIES: [&str; 6] = [
 ];
 
 /// Reads the validation cities, or those named, or all others for the training split.
-pub(super) fn load_labelled(root: &Path, options: &DatasetOptions) -> Result<Dataset, EvalError> {
+pub(super) fn load_labelled(
+    root: &Path,
+    options: &DatasetOptions,
+) -> Result<Dataset, DatasetError> {
     let name = "msls-val";
     let angle = options.max_angle_deg.unwrap_or(VIEW_ANGLE_DEG);
     let split = options.split.unwrap_or(Split::Val);
@@ -84,7 +89,7 @@ pub(super) fn load_labelled(root: &Path, options: &DatasetOptions) -> Result<Dat
 }
 
 /// Reads the test cities; their answers are withheld, so every truth is unknown.
-pub(super) fn load_test(root: &Path, options: &DatasetOptions) -> Result<Dataset, EvalError> {
+pub(super) fn load_test(root: &Path, options: &DatasetOptions) -> Result<Dataset, DatasetError> {
     let name = "msls-test";
     let folder = require(name, root.join("test"), EXPECTED_TEST)?;
     let mut reader = Reader {
@@ -110,7 +115,11 @@ pub(super) fn load_test(root: &Path, options: &DatasetOptions) -> Result<Dataset
     })
 }
 
-fn cities(folder: &Path, split: Split, options: &DatasetOptions) -> Result<Vec<String>, EvalError> {
+fn cities(
+    folder: &Path,
+    split: Split,
+    options: &DatasetOptions,
+) -> Result<Vec<String>, DatasetError> {
     if !options.cities.is_empty() {
         return Ok(options.cities.clone());
     }
@@ -119,8 +128,8 @@ fn cities(folder: &Path, split: Split, options: &DatasetOptions) -> Result<Vec<S
         Split::Test => Ok(TEST_CITIES.map(str::to_owned).to_vec()),
         Split::Train => {
             let mut cities = Vec::new();
-            for entry in std::fs::read_dir(folder).map_err(EvalError::io(folder))? {
-                let entry = entry.map_err(EvalError::io(folder))?;
+            for entry in std::fs::read_dir(folder).map_err(DatasetError::io(folder))? {
+                let entry = entry.map_err(DatasetError::io(folder))?;
                 let name = entry.file_name().to_string_lossy().into_owned();
                 if entry.path().is_dir()
                     && !VAL_CITIES.contains(&name.as_str())
@@ -156,7 +165,7 @@ impl Reader<'_> {
         root: &Path,
         city: &str,
         side: &str,
-    ) -> Result<Vec<Item>, EvalError> {
+    ) -> Result<Vec<Item>, DatasetError> {
         let folder = require(dataset, root.join(city).join(side), EXPECTED)?;
         let raw = self.raw_rows(
             &require(dataset, folder.join("raw.csv"), EXPECTED)?,
@@ -208,7 +217,7 @@ impl Reader<'_> {
         root: &Path,
         city: &str,
         side: &str,
-    ) -> Result<Vec<Item>, EvalError> {
+    ) -> Result<Vec<Item>, DatasetError> {
         let folder = require(dataset, root.join(city).join(side), EXPECTED_TEST)?;
         let path = require(dataset, folder.join("subtask_index.csv"), EXPECTED_TEST)?;
         let table = Table::read(&path)?;
@@ -239,7 +248,7 @@ impl Reader<'_> {
         path: &Path,
         city: &str,
         side: &str,
-    ) -> Result<Vec<(String, MetricPoint)>, EvalError> {
+    ) -> Result<Vec<(String, MetricPoint)>, DatasetError> {
         let table = Table::read(path)?;
         let (key, east, north) = (
             table.column("key")?,
@@ -274,7 +283,7 @@ impl Reader<'_> {
         path: &Path,
         city: &str,
         side: &str,
-    ) -> Result<HashMap<String, RawRow>, EvalError> {
+    ) -> Result<HashMap<String, RawRow>, DatasetError> {
         let table = Table::read(path)?;
         let (key, pano) = (table.column("key")?, table.column("pano")?);
         let angle = table.optional_column("ca");
@@ -301,7 +310,7 @@ impl Reader<'_> {
         Ok(rows)
     }
 
-    fn subtask_keys(&self, path: &Path) -> Result<HashSet<String>, EvalError> {
+    fn subtask_keys(&self, path: &Path) -> Result<HashSet<String>, DatasetError> {
         let table = Table::read(path)?;
         let (key, subtask) = (table.column("key")?, table.column(self.subtask)?);
         let mut keys = HashSet::new();
@@ -319,7 +328,7 @@ impl Reader<'_> {
         city: &str,
         side: &str,
         positions: &[(String, MetricPoint)],
-    ) -> Result<(), EvalError> {
+    ) -> Result<(), DatasetError> {
         let known: HashSet<&str> = positions.iter().map(|(key, _)| key.as_str()).collect();
         for (name, _) in list_images(&folder.join("images"))? {
             let key = name

@@ -7,11 +7,12 @@
 //! beside them, only the frames it lists take part: the usual evaluation leaves tunnels and
 //! stations out.
 
-use super::files::{list_images, require};
+use super::DatasetError;
+use super::layout::require;
 use super::utm::find_split;
-use super::utm_name::UtmName;
 use super::{Dataset, DatasetOptions, Item, Skipped, Split, Truth};
-use crate::eval::EvalError;
+use placeformer_core::folder::list_images;
+use placeformer_core::geography::UtmName;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -22,14 +23,14 @@ const EXPECTED: &str =
     "images/test/{database,queries}, or summer/ (database) and winter/ (queries)";
 
 /// Reads both sides and matches them by frame.
-pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, EvalError> {
+pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, DatasetError> {
     let (mut database_dir, mut queries_dir) = folders(root, options.split.unwrap_or(Split::Test))?;
     if options.swap {
         std::mem::swap(&mut database_dir, &mut queries_dir);
     }
     let clean = clean_frames(root)?;
     let mut skipped = Vec::new();
-    let mut read = |folder: &Path| -> Result<(Vec<Item>, Vec<u64>), EvalError> {
+    let mut read = |folder: &Path| -> Result<(Vec<Item>, Vec<u64>), DatasetError> {
         let (mut items, mut frames) = (Vec::new(), Vec::new());
         for (name, path) in list_images(folder)? {
             match frame_of(&name) {
@@ -87,12 +88,12 @@ pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, Eva
 }
 
 /// The frames that take part, if the data set says so.
-fn clean_frames(root: &Path) -> Result<Option<BTreeSet<u64>>, EvalError> {
+fn clean_frames(root: &Path) -> Result<Option<BTreeSet<u64>>, DatasetError> {
     let path = root.join(CLEAN);
     let text = match std::fs::read_to_string(&path) {
         Ok(text) => text,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-        Err(error) => return Err(EvalError::io(&path)(error)),
+        Err(error) => return Err(DatasetError::io(&path)(error)),
     };
     let mut frames = BTreeSet::new();
     for (line, name) in (1..)
@@ -100,7 +101,7 @@ fn clean_frames(root: &Path) -> Result<Option<BTreeSet<u64>>, EvalError> {
         .filter(|(_, name)| !name.is_empty())
     {
         let reason = || format!("{name:?} has no frame number");
-        let frame = frame_of(name).ok_or_else(|| EvalError::Record {
+        let frame = frame_of(name).ok_or_else(|| DatasetError::Record {
             path: path.clone(),
             line,
             reason: reason(),
@@ -110,7 +111,7 @@ fn clean_frames(root: &Path) -> Result<Option<BTreeSet<u64>>, EvalError> {
     Ok(Some(frames))
 }
 
-fn folders(root: &Path, split: Split) -> Result<(PathBuf, PathBuf), EvalError> {
+fn folders(root: &Path, split: Split) -> Result<(PathBuf, PathBuf), DatasetError> {
     let films = (root.join("summer"), root.join("winter"));
     if films.0.exists() && films.1.exists() {
         return Ok(films);

@@ -4,10 +4,10 @@
 //! below the two folders. A query the file does not mention stays [`Truth::Unknown`]: it is
 //! searched but not counted.
 
-use super::files::list_images;
+use super::DatasetError;
 use super::table::Table;
 use super::{Dataset, Item, Truth, positions};
-use crate::eval::EvalError;
+use placeformer_core::folder::list_images;
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -17,7 +17,7 @@ pub fn load_pairs(
     database_dir: &Path,
     queries_dir: &Path,
     ground_truth: &Path,
-) -> Result<Dataset, EvalError> {
+) -> Result<Dataset, DatasetError> {
     let mut database = items(database_dir)?;
     let mut queries = items(queries_dir)?;
     if let Some(folder) = ground_truth.parent() {
@@ -47,7 +47,7 @@ pub fn load_pairs(
     .checked(database_dir)
 }
 
-fn items(folder: &Path) -> Result<Vec<Item>, EvalError> {
+fn items(folder: &Path) -> Result<Vec<Item>, DatasetError> {
     Ok(list_images(folder)?
         .into_iter()
         .map(|(name, path)| Item::new(name, path))
@@ -118,14 +118,14 @@ impl<'a> Labels<'a> {
         Ok(())
     }
 
-    fn finish(self) -> Result<(Vec<Truth>, Vec<String>), EvalError> {
+    fn finish(self) -> Result<(Vec<Truth>, Vec<String>), DatasetError> {
         for (mut names, folder) in self.unknown.into_iter().zip(self.folders) {
             names.sort_unstable();
             names.dedup();
             if let Some(example) = names.first().cloned() {
                 let (path, folder, count) =
                     (self.ground_truth.to_owned(), folder.to_owned(), names.len());
-                return Err(EvalError::UnknownImages {
+                return Err(DatasetError::UnknownImages {
                     path,
                     folder,
                     count,
@@ -171,7 +171,7 @@ mod tests {
         root
     }
 
-    fn load(root: &Path) -> Result<Dataset, EvalError> {
+    fn load(root: &Path) -> Result<Dataset, DatasetError> {
         load_pairs(
             &root.join("database"),
             &root.join("queries"),
@@ -227,7 +227,7 @@ mod tests {
         );
         assert!(matches!(
             load(root.path()),
-            Err(EvalError::Empty {
+            Err(DatasetError::Empty {
                 side: "database",
                 ..
             })

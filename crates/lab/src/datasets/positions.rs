@@ -5,17 +5,19 @@
 //! data set find their rows in one table. Positions become metres in the plane of their UTM zones;
 //! regions far apart become groups, see `zones`.
 
+use super::DatasetError;
+use super::Item;
 use super::table::{Column, Row, Table};
 use super::zones::Zones;
-use super::{Item, UtmZone, relative_name};
-use crate::eval::EvalError;
+use placeformer_core::folder::relative_name;
+use placeformer_core::geography::UtmZone;
 use placeformer_core::types::GeoPoint;
 use std::collections::HashMap;
 use std::path::Path;
 
 /// Gives the items of `sides` the positions and headings that `folder/positions.csv` has for them,
 /// if it is there.
-pub(super) fn locate(folder: &Path, sides: [&mut [Item]; 2]) -> Result<(), EvalError> {
+pub(super) fn locate(folder: &Path, sides: [&mut [Item]; 2]) -> Result<(), DatasetError> {
     let path = folder.join("positions.csv");
     if !path.exists() {
         return Ok(());
@@ -51,7 +53,7 @@ pub(super) fn locate(folder: &Path, sides: [&mut [Item]; 2]) -> Result<(), EvalE
     Ok(())
 }
 
-fn point(row: Row<'_>, lat: Column, lon: Column) -> Result<Option<GeoPoint>, EvalError> {
+fn point(row: Row<'_>, lat: Column, lon: Column) -> Result<Option<GeoPoint>, DatasetError> {
     if row.text(lat).is_empty() && row.text(lon).is_empty() {
         return Ok(None);
     }
@@ -63,7 +65,7 @@ fn point(row: Row<'_>, lat: Column, lon: Column) -> Result<Option<GeoPoint>, Eva
 mod tests {
     use super::*;
 
-    fn located(csv: &str) -> Result<[Vec<Item>; 2], EvalError> {
+    fn located(csv: &str) -> Result<[Vec<Item>; 2], DatasetError> {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("positions.csv"), csv).unwrap();
         let item = |name: &str| Item::new(name, folder.path().join(name));

@@ -5,11 +5,12 @@
 //! names query images with a 4x4 camera-to-world matrix each; `robotcar_v2_test.txt` names those
 //! whose poses are withheld. Metadata say `.png` where the images are `.jpg`.
 
-use super::files::require;
+use super::DatasetError;
+use super::layout::require;
 use super::neighbours::NeighbourGrid;
-use super::{Dataset, DatasetOptions, Item, MetricPoint, Split, Truth};
-use crate::eval::EvalError;
+use super::{Dataset, DatasetOptions, Item, Split, Truth};
 use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
+use placeformer_core::geography::MetricPoint;
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -42,7 +43,7 @@ impl Pose {
 }
 
 /// Reads the references seen by the queries' cameras, and the queries of one split.
-pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, EvalError> {
+pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, DatasetError> {
     let images = require(NAME, root.join("images"), EXPECTED)?;
     let queries = match options.split.unwrap_or(Split::Train) {
         Split::Test => read_list(
@@ -132,12 +133,12 @@ fn lines(text: &str) -> impl Iterator<Item = (u64, &str)> {
         .filter(|(_, line)| !line.is_empty())
 }
 
-fn read_text(path: &Path) -> Result<String, EvalError> {
-    std::fs::read_to_string(path).map_err(EvalError::io(path))
+fn read_text(path: &Path) -> Result<String, DatasetError> {
+    std::fs::read_to_string(path).map_err(DatasetError::io(path))
 }
 
-fn wrong(path: &Path, line: u64, reason: impl Into<String>) -> EvalError {
-    EvalError::Record {
+fn wrong(path: &Path, line: u64, reason: impl Into<String>) -> DatasetError {
+    DatasetError::Record {
         path: path.to_owned(),
         line,
         reason: reason.into(),
@@ -148,7 +149,7 @@ fn numbers<'a>(
     path: &Path,
     line: u64,
     fields: impl Iterator<Item = &'a str>,
-) -> Result<Vec<f64>, EvalError> {
+) -> Result<Vec<f64>, DatasetError> {
     let parse = |field: &str| match field.parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),
         _ => Err(wrong(path, line, format!("{field:?} is not a number"))),
@@ -156,7 +157,7 @@ fn numbers<'a>(
     fields.map(parse).collect()
 }
 
-fn read_list(path: &Path, images: &Path) -> Result<Vec<Item>, EvalError> {
+fn read_list(path: &Path, images: &Path) -> Result<Vec<Item>, DatasetError> {
     let text = read_text(path)?;
     Ok(lines(&text)
         .filter_map(|(_, line)| line.split_whitespace().next())
@@ -165,7 +166,7 @@ fn read_list(path: &Path, images: &Path) -> Result<Vec<Item>, EvalError> {
 }
 
 /// `name` and 16 numbers, the rows of a camera-to-world matrix.
-fn read_posed(path: &Path, images: &Path) -> Result<Vec<Item>, EvalError> {
+fn read_posed(path: &Path, images: &Path) -> Result<Vec<Item>, DatasetError> {
     let text = read_text(path)?;
     let mut items = Vec::new();
     for (line, content) in lines(&text) {
@@ -206,7 +207,7 @@ fn read_posed(path: &Path, images: &Path) -> Result<Vec<Item>, EvalError> {
 }
 
 /// The cameras of an NVM model: a count, then `name focal qw qx qy qz cx cy cz distortion 0` each.
-fn read_nvm(path: &Path, images: &Path) -> Result<Vec<Item>, EvalError> {
+fn read_nvm(path: &Path, images: &Path) -> Result<Vec<Item>, DatasetError> {
     let text = read_text(path)?;
     let mut lines = lines(&text);
     match lines.next() {

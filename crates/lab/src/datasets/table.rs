@@ -1,7 +1,7 @@
 //! CSV files of the data sets: columns by name, errors by line, Windows line ends and byte-order
 //! marks tolerated.
 
-use crate::eval::EvalError;
+use super::DatasetError;
 use std::path::{Path, PathBuf};
 
 /// A whole CSV file with a header.
@@ -17,13 +17,13 @@ pub(super) struct Column(usize);
 
 impl Table {
     /// Reads `path` whole; every row must have as many fields as the header.
-    pub(super) fn read(path: &Path) -> Result<Self, EvalError> {
-        let bytes = std::fs::read(path).map_err(EvalError::io(path))?;
+    pub(super) fn read(path: &Path) -> Result<Self, DatasetError> {
+        let bytes = std::fs::read(path).map_err(DatasetError::io(path))?;
         let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
         let mut reader = csv::ReaderBuilder::new()
             .trim(csv::Trim::All)
             .from_reader(bytes);
-        let record_error = |error: csv::Error| EvalError::Record {
+        let record_error = |error: csv::Error| DatasetError::Record {
             path: path.to_owned(),
             line: error.position().map_or(1, csv::Position::line),
             reason: error.to_string(),
@@ -46,15 +46,16 @@ impl Table {
     }
 
     /// The column called `name`.
-    pub(super) fn column(&self, name: &str) -> Result<Column, EvalError> {
-        self.optional_column(name).ok_or_else(|| EvalError::Record {
-            path: self.path.clone(),
-            line: 1,
-            reason: format!(
-                "there is no column {name:?}; the columns are {}",
-                self.headers.join(", ")
-            ),
-        })
+    pub(super) fn column(&self, name: &str) -> Result<Column, DatasetError> {
+        self.optional_column(name)
+            .ok_or_else(|| DatasetError::Record {
+                path: self.path.clone(),
+                line: 1,
+                reason: format!(
+                    "there is no column {name:?}; the columns are {}",
+                    self.headers.join(", ")
+                ),
+            })
     }
 
     /// The column called `name`, if there is one.
@@ -88,7 +89,7 @@ impl<'t> Row<'t> {
     }
 
     /// A finite number.
-    pub(super) fn number(self, column: Column) -> Result<f64, EvalError> {
+    pub(super) fn number(self, column: Column) -> Result<f64, DatasetError> {
         let text = self.text(column);
         match text.parse::<f64>() {
             Ok(value) if value.is_finite() => Ok(value),
@@ -100,7 +101,7 @@ impl<'t> Row<'t> {
     }
 
     /// `True`, `False`, `1`, `0` in any case.
-    pub(super) fn flag(self, column: Column) -> Result<bool, EvalError> {
+    pub(super) fn flag(self, column: Column) -> Result<bool, DatasetError> {
         match self.text(column).to_ascii_lowercase().as_str() {
             "true" | "1" => Ok(true),
             "false" | "0" => Ok(false),
@@ -112,9 +113,9 @@ impl<'t> Row<'t> {
     }
 
     /// An error that names this row.
-    pub(super) fn error(self, reason: String) -> EvalError {
+    pub(super) fn error(self, reason: String) -> DatasetError {
         let line = self.record.position().map_or(1, csv::Position::line);
-        EvalError::Record {
+        DatasetError::Record {
             path: self.table.path.clone(),
             line,
             reason,

@@ -5,12 +5,14 @@
 //! Zones that touch are projected into one; zones that do not (MSLS has San Francisco and
 //! Copenhagen) are kept apart as groups, see `zones`.
 
-use super::files::{list_images, require};
+use super::DatasetError;
+use super::layout::require;
 use super::neighbours::truth_by_distance;
-use super::utm_name::{UtmName, UtmZone};
 use super::zones::Zones;
-use super::{Dataset, DatasetOptions, Item, MetricPoint, Skipped, Split};
-use crate::eval::EvalError;
+use super::{Dataset, DatasetOptions, Item, Skipped, Split};
+use placeformer_core::folder::list_images;
+use placeformer_core::geography::MetricPoint;
+use placeformer_core::geography::{UtmName, UtmZone};
 use std::path::{Path, PathBuf};
 
 const EXPECTED: &str =
@@ -25,10 +27,10 @@ pub(super) fn load(
     name: &'static str,
     root: &Path,
     options: &DatasetOptions,
-) -> Result<Dataset, EvalError> {
+) -> Result<Dataset, DatasetError> {
     let split = options.split.unwrap_or(Split::Test);
     let wanted = || root.join("images").join(split.as_str());
-    let folder = find_split(root, split).ok_or_else(|| EvalError::Layout {
+    let folder = find_split(root, split).ok_or_else(|| DatasetError::Layout {
         dataset: name,
         path: wanted(),
         expected: EXPECTED,
@@ -93,7 +95,7 @@ struct Placed {
     zone: Option<UtmZone>,
 }
 
-fn read(folder: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<Placed>, EvalError> {
+fn read(folder: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<Placed>, DatasetError> {
     let mut images = Vec::new();
     for (name, path) in list_images(folder)? {
         match UtmName::parse(&name) {

@@ -6,7 +6,7 @@
 //! farther than into the neighbouring zone. Clusters are told apart by the group of their images;
 //! images of different groups are never compared.
 
-use super::{MetricPoint, UtmZone};
+use placeformer_core::geography::{MetricPoint, UtmZone};
 use placeformer_core::types::GeoPoint;
 use std::collections::BTreeSet;
 

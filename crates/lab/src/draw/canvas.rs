@@ -2,8 +2,8 @@
 //! score labels.
 
 use super::DrawError;
-use placeformer_vision::image::RgbImage;
 use placeformer_core::types::ImageSize;
+use placeformer_vision::image::RgbImage;
 use tiny_skia::{
     Color, FillRule, Paint, PathBuilder, Pixmap, PremultipliedColorU8, Rect, Stroke, Transform,
 };

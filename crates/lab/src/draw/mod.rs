@@ -10,10 +10,9 @@ mod panels;
 
 pub use panels::{AttentionMap, CombinationLines, MatchSide, attention_picture, match_picture};
 
-use placeformer_core::error::ErrorCode;
-use placeformer_vision::image::{ImageError, RgbImage, encode_jpeg};
-use placeformer_core::types::ImageSize;
 use base64::Engine;
+use placeformer_core::types::ImageSize;
+use placeformer_vision::image::{ImageError, RgbImage, encode_jpeg};
 
 /// Why a picture cannot be drawn.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -42,18 +41,6 @@ pub enum DrawError {
     /// Resizing or encoding failed.
     #[error(transparent)]
     Image(#[from] ImageError),
-}
-
-impl DrawError {
-    /// The row of the error table.
-    pub fn code(&self) -> ErrorCode {
-        match self {
-            Self::AttentionShape { .. } | Self::NoSuchPatch { .. } | Self::Size(_) => {
-                ErrorCode::Internal
-            }
-            Self::Image(error) => error.code(),
-        }
-    }
 }
 
 /// Shrinks `image` so that it fits `longest_side` pixels, keeping its shape; never enlarges.

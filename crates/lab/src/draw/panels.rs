@@ -2,8 +2,8 @@
 
 use super::DrawError;
 use super::canvas::{Canvas, Panel, Rgba};
-use placeformer_vision::image::RgbImage;
 use placeformer_core::types::{ImageSize, PackedPatches, SCALES, ScaleSet};
+use placeformer_vision::image::RgbImage;
 
 /// Height of every panel in pixels.
 const PANEL_HEIGHT: u32 = 360;
@@ -293,8 +293,8 @@ fn heat_colour(heat: f32) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use placeformer_core::types::{PatchGrid, PoolingStride};
     use half::f16;
+    use placeformer_core::types::{PatchGrid, PoolingStride};
 
     fn patches(index: Vec<u16>, counts: [usize; 3]) -> PackedPatches {
         let n = index.len();

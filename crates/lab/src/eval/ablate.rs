@@ -11,17 +11,17 @@ mod cuts;
 mod full_precision;
 
 use super::EvalError;
-use super::datasets::{Dataset, Truth};
 use super::features::{Describe, FeatureCache, Features, GlobalKind};
 use super::measure::{RECALL_AT, first_hit, recall_at};
 use super::run::{Answer, rerank_all, search_all};
 use super::summary::{AtK, Both};
-use placeformer_vision::extract::{ExtractConfig, HeadChoice, Preset};
-use placeformer_vision::rerank::RerankConfig;
-use placeformer_store::codec;
-use placeformer_core::types::{ImageSize, SCALES, ScaleSet};
+use crate::datasets::{Dataset, Truth};
 use cuts::{Codec, Components, Cut, SAMPLE, apply, unpack};
 use indicatif::{MultiProgress, ProgressBar};
+use placeformer_core::types::{ImageSize, SCALES, ScaleSet};
+use placeformer_store::codec;
+use placeformer_vision::extract::{ExtractConfig, HeadChoice, Preset};
+use placeformer_vision::rerank::RerankConfig;
 use serde::Serialize;
 use std::cell::OnceCell;
 use std::path::Path;
@@ -318,7 +318,8 @@ const ALL_PATCHES: [usize; SCALES] = [1 << 16; SCALES];
 
 /// Every row; where no row of an axis is the base setting, it is added.
 fn variants(base: &Base<'_>) -> Result<Vec<Variant>, EvalError> {
-    let invalid = |error: placeformer_core::types::InvalidValue| EvalError::Setting(error.to_string());
+    let invalid =
+        |error: placeformer_core::types::InvalidValue| EvalError::Setting(error.to_string());
     let extract = base.extract.effective().map_err(invalid)?;
     let bare = ExtractConfig {
         head: HeadChoice::None,
@@ -446,7 +447,10 @@ struct Rows<'a> {
 }
 
 impl Rows<'_> {
-    fn scales(&mut self, extract: &ExtractConfig) -> Result<(), placeformer_core::types::InvalidValue> {
+    fn scales(
+        &mut self,
+        extract: &ExtractConfig,
+    ) -> Result<(), placeformer_core::types::InvalidValue> {
         let parse = |text: &str| {
             text.split(',')
                 .map(str::parse)

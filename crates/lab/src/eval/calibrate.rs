@@ -8,14 +8,14 @@
 //! just beyond the radius still shows the same street.
 
 use super::EvalError;
-use super::datasets::{Dataset, NeighbourGrid, Truth};
 use super::measure::{
     self, CalibrationError, FittedCurve, ReliabilityBin, ThresholdCheck, TopOne, Trusted,
 };
 use super::places::places_of;
 use super::run::Answer;
-use crate::pipeline::built_in_calibration;
+use crate::datasets::{Dataset, NeighbourGrid, Truth};
 use placeformer_core::types::{Calibration, ConfidenceCurve, ModelId, RerankId};
+use placeformer_models::built_in_calibration;
 use serde::Serialize;
 use std::fmt::Write;
 
@@ -420,9 +420,10 @@ fn percent(share: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::datasets::{Item, MetricPoint};
     use super::super::run::{Candidate, Neighbour};
     use super::*;
+    use crate::datasets::Item;
+    use placeformer_core::geography::MetricPoint;
     use placeformer_vision::rerank::PairScore;
 
     fn dataset(truth: Vec<Truth>, references: usize) -> Dataset {

@@ -1,7 +1,7 @@
 //! What can go wrong while measuring, each with the file and the cause.
 
+use crate::datasets::DatasetError;
 use crate::draw::DrawError;
-use placeformer_core::error::ErrorCode;
 use placeformer_vision::extract::ExtractError;
 use placeformer_vision::image::ImageError;
 use std::path::{Path, PathBuf};
@@ -17,50 +17,9 @@ pub enum EvalError {
         /// What the system said.
         source: std::io::Error,
     },
-    /// The folder does not have the layout of the data set named.
-    #[error("{dataset}: {} is missing; expected {expected}", path.display())]
-    Layout {
-        /// Name of the data set.
-        dataset: &'static str,
-        /// The missing file or folder.
-        path: PathBuf,
-        /// What the layout should look like.
-        expected: &'static str,
-    },
-    /// A line of a metadata file makes no sense.
-    #[error("{}, line {line}: {reason}", path.display())]
-    Record {
-        /// The file.
-        path: PathBuf,
-        /// 1-based line.
-        line: u64,
-        /// What is wrong.
-        reason: String,
-    },
-    /// The ground truth speaks of images that are not in the folders.
-    #[error("{}: {count} image names are not in {}, among them {example:?}", path.display(), folder.display())]
-    UnknownImages {
-        /// The ground-truth file.
-        path: PathBuf,
-        /// The folder that should hold them.
-        folder: PathBuf,
-        /// How many names.
-        count: usize,
-        /// One of them.
-        example: String,
-    },
-    /// Nothing to search in, or nothing to ask.
-    #[error("{dataset}: no usable {side} image in {}{detail}", path.display())]
-    Empty {
-        /// Name of the data set.
-        dataset: String,
-        /// `database` or `query`.
-        side: &'static str,
-        /// Where they should be.
-        path: PathBuf,
-        /// What else is known, such as how many were skipped and why.
-        detail: String,
-    },
+    /// A data set could not be read.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
     /// A setting is out of range or does not go with another.
     #[error("{0}")]
     Setting(String),
@@ -76,21 +35,6 @@ pub enum EvalError {
 }
 
 impl EvalError {
-    /// The row of the error table.
-    pub fn code(&self) -> ErrorCode {
-        match self {
-            Self::Io { .. } => ErrorCode::Internal,
-            Self::Layout { .. }
-            | Self::Record { .. }
-            | Self::UnknownImages { .. }
-            | Self::Empty { .. }
-            | Self::Setting(_) => ErrorCode::InvalidParameter,
-            Self::Image(error) => error.code(),
-            Self::Draw(error) => error.code(),
-            Self::Extract(error) => error.code(),
-        }
-    }
-
     /// Attaches a path to a system error, for `map_err`.
     pub fn io(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.as_ref().to_owned();

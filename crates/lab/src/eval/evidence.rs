@@ -1,13 +1,13 @@
 //! Why two images were found to match, or not: everything the picture of a match needs, computed
 //! anew for one pair.
 
-use placeformer_vision::extract::pack;
 use super::EvalError;
 use crate::draw::{AttentionMap, CombinationLines, MatchSide, match_picture};
+use placeformer_core::types::PackedPatches;
 use placeformer_vision::extract::Extractor;
+use placeformer_vision::extract::pack;
 use placeformer_vision::image::{ImageConfig, RgbImage, decode, load_tensor};
 use placeformer_vision::rerank::CombinationMatch;
-use placeformer_core::types::PackedPatches;
 
 /// What the model saw in one image.
 pub struct Seen {

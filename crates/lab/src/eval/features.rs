@@ -9,14 +9,14 @@
 //! vanishes in silence.
 
 use super::EvalError;
-use super::datasets::Item;
-use placeformer_vision::extract::Extractor;
-use placeformer_vision::image::{ImageConfig, RgbImage, encode_jpeg, load_tensor};
-use placeformer_store::codec;
+use crate::datasets::Item;
+use indicatif::ProgressBar;
 use placeformer_core::types::{
     ContentHash, Descriptor, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches,
 };
-use indicatif::ProgressBar;
+use placeformer_store::codec;
+use placeformer_vision::extract::Extractor;
+use placeformer_vision::image::{ImageConfig, RgbImage, encode_jpeg, load_tensor};
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 use rayon::prelude::*;

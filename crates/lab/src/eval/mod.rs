@@ -1,6 +1,6 @@
 //! Recall on data sets: readers, measures, reports.
 //!
-//! [`datasets`] turns the layouts people have into one shape; [`features`] describes every image
+//! [`datasets`](crate::datasets) turns the layouts people have into one shape; [`features`] describes every image
 //! and keeps the result on disk; [`run`] searches and re-ranks as the service does; [`measure`]
 //! holds the numbers as pure functions; [`summary`] gathers them into one value, which [`report`]
 //! prints and draws. [`ablate`] repeats it along the axes of the paper's tables; [`calibrate`]
@@ -8,7 +8,6 @@
 
 pub mod ablate;
 pub mod calibrate;
-pub mod datasets;
 mod error;
 pub mod evidence;
 pub mod features;

@@ -1,8 +1,8 @@
 //! Which queries show the same place, so that what is learnt from one is not tested on its
 //! neighbour.
 
-use super::datasets::{Dataset, NeighbourGrid, Truth};
 use super::measure::FOLDS;
+use crate::datasets::{Dataset, NeighbourGrid, Truth};
 use std::collections::BTreeMap;
 
 /// Queries without a match that stand this near to each other show one place.
@@ -91,8 +91,9 @@ impl Sets {
 
 #[cfg(test)]
 mod tests {
-    use super::super::datasets::{Item, MetricPoint};
     use super::*;
+    use crate::datasets::Item;
+    use placeformer_core::geography::MetricPoint;
 
     fn dataset(truth: Vec<Truth>) -> Dataset {
         let items = |n: usize| (0..n).map(|i| Item::new(i.to_string(), "x")).collect();

@@ -1,8 +1,8 @@
 //! Files that the public benchmarks accept, where the answers are withheld.
 
 use super::EvalError;
-use super::datasets::{Dataset, Item};
 use super::run::Answer;
+use crate::datasets::{Dataset, Item};
 use std::io::Write;
 use std::path::Path;
 
@@ -94,11 +94,11 @@ fn write_lines(path: &Path, lines: impl Iterator<Item = String>) -> Result<(), E
 
 #[cfg(test)]
 mod tests {
-    use super::super::datasets::{Pose, Truth};
     use super::super::run::{Candidate, Neighbour};
     use super::*;
-    use placeformer_vision::rerank::PairScore;
+    use crate::datasets::{Pose, Truth};
     use nalgebra::{UnitQuaternion, Vector3};
+    use placeformer_vision::rerank::PairScore;
 
     fn dataset(queries: &[&str], database: Vec<Item>) -> Dataset {
         let queries: Vec<Item> = queries.iter().map(|name| Item::new(*name, *name)).collect();

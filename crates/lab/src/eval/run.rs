@@ -2,10 +2,10 @@
 
 use super::EvalError;
 use super::features::Features;
+use indicatif::ProgressBar;
+use placeformer_core::types::{GLOBAL_DIM, PackedPatches, ReferenceFilter, ReferenceId};
 use placeformer_vision::rerank::{PairScore, RerankConfig, Reranked, Reranker};
 use placeformer_vision::search::{IndexEntry, MapIndex};
-use placeformer_core::types::{GLOBAL_DIM, PackedPatches, ReferenceFilter, ReferenceId};
-use indicatif::ProgressBar;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::sync::Arc;

@@ -2,13 +2,13 @@
 
 use super::EvalError;
 use super::calibrate::{Applied, BestAnswers, shipped_curve};
-use super::datasets::{Dataset, Skipped, Truth};
 use super::features::{Features, GlobalKind, Unreadable};
 use super::measure::{self, Interval, Judged, PoseAccuracy, RECALL_AT, Rejection, ReliabilityBin};
 use super::run::{Answer, QuerySeconds};
+use crate::datasets::{Dataset, Skipped, Truth};
+use placeformer_core::types::{Calibration, ConfidenceWeights, ModelId};
 use placeformer_vision::extract::ExtractConfig;
 use placeformer_vision::rerank::RerankConfig;
-use placeformer_core::types::{Calibration, ConfidenceWeights, ModelId};
 use serde::Serialize;
 use std::collections::BTreeMap;
 

@@ -2,8 +2,8 @@
 
 use super::random::{Dice, seed_of};
 use super::{Capture, Condition, PLACES_PER_STREET, StreetWorld, Viewpoint};
-use placeformer_vision::image::{ImageError, encode_jpeg};
 use placeformer_core::types::{GeoPoint, Heading, ImageSize};
+use placeformer_vision::image::{ImageError, encode_jpeg};
 use rayon::prelude::*;
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -3,8 +3,8 @@
 use super::random::{Dice, fractal, lattice};
 use super::raster::{Camera, Fragment, Frame, Surface, Vec3};
 use super::scene::Street;
-use placeformer_vision::image::RgbImage;
 use placeformer_core::types::{ImageSize, InvalidValue};
+use placeformer_vision::image::RgbImage;
 use std::fmt;
 use std::str::FromStr;
 

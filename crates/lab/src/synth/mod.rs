@@ -24,9 +24,9 @@ mod texture;
 pub use dataset::{DatasetError, DatasetOptions, DatasetSummary, image_count, write_dataset};
 pub use light::Condition;
 
-use placeformer_vision::image::RgbImage;
-use placeformer_core::types::{GeoPoint, Heading, ImageSize};
 use light::{Light, develop};
+use placeformer_core::types::{GeoPoint, Heading, ImageSize};
+use placeformer_vision::image::RgbImage;
 use random::{Dice, seed_of};
 use raster::{Camera, Frame, Vec3};
 use scene::{Street, Traffic};

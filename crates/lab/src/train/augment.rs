@@ -5,8 +5,8 @@
 //! mirrors: a mirrored street is another place.
 
 use super::TrainError;
-use placeformer_vision::image::{DEVIATION, MEAN};
 use placeformer_core::types::ImageTensor;
+use placeformer_vision::image::{DEVIATION, MEAN};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};

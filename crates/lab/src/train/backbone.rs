@@ -10,12 +10,12 @@ use super::loss::normalise_rows;
 use super::trainer::{Sample, Session, TripletModel, run};
 use super::triplets::TripletSet;
 use super::{Augmentation, Outcome, TrainError};
+use candle_core::{D, Device, Tensor, Var};
+use placeformer_core::types::{GLOBAL_DIM, ImageTensor};
 use placeformer_vision::extract::{
     Aggregate, EncoderSpec, Head, LAYER_NORM_EPS, VitWeights, interpolate_positions,
 };
 use placeformer_vision::image::{ImageConfig, load_tensor};
-use placeformer_core::types::{GLOBAL_DIM, ImageTensor};
-use candle_core::{D, Device, Tensor, Var};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;

@@ -7,8 +7,8 @@
 use super::TrainError;
 use super::adam::Adam;
 use super::config::{TrainConfig, ValidationRecall};
-use placeformer_vision::extract::write_atomically;
 use candle_core::{Device, Tensor};
+use placeformer_core::files::write_atomically;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::Path;
@@ -199,7 +199,7 @@ impl Checkpoint {
                     path: path.clone(),
                     reason: error.to_string(),
                 })?;
-        Ok(write_atomically(&path, &bytes)?)
+        write_atomically(&path, &bytes).map_err(|source| TrainError::Io { path, source })
     }
 }
 

@@ -1,6 +1,5 @@
 //! What can go wrong while training, each with its cause.
 
-use placeformer_core::error::ErrorCode;
 use std::path::PathBuf;
 
 /// Why training stopped or never started.
@@ -47,18 +46,5 @@ pub enum TrainError {
 impl From<candle_core::Error> for TrainError {
     fn from(error: candle_core::Error) -> Self {
         Self::Tensor(error.to_string())
-    }
-}
-
-impl TrainError {
-    /// The row of the error table.
-    pub fn code(&self) -> ErrorCode {
-        match self {
-            Self::Setting(_) | Self::NoTriplets(_) => ErrorCode::InvalidParameter,
-            Self::Extract(error) => error.code(),
-            Self::Diverged { .. } | Self::Checkpoint { .. } | Self::Io { .. } | Self::Tensor(_) => {
-                ErrorCode::Internal
-            }
-        }
     }
 }

@@ -5,7 +5,8 @@
 //! is given to neither.
 
 use super::TrainError;
-use crate::datasets::{Dataset, Item, MetricPoint, NeighbourGrid, Truth};
+use crate::datasets::{Dataset, Item, NeighbourGrid, Truth};
+use placeformer_core::geography::MetricPoint;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;

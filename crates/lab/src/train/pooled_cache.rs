@@ -7,9 +7,9 @@
 //! killed process stopped.
 
 use super::TrainError;
+use placeformer_core::types::{ContentHash, ImageTensor};
 use placeformer_vision::extract::Extractor;
 use placeformer_vision::image::{ImageConfig, load_tensor};
-use placeformer_core::types::{ContentHash, ImageTensor};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::fs::{self, File, OpenOptions};

@@ -2,7 +2,8 @@
 //! 25 m).
 
 use super::TrainError;
-use crate::datasets::{Dataset, Item, MetricPoint, NeighbourGrid};
+use crate::datasets::{Dataset, Item, NeighbourGrid};
+use placeformer_core::geography::MetricPoint;
 use placeformer_core::types::ContentHash;
 use std::path::PathBuf;
 

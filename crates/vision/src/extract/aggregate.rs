@@ -111,7 +111,12 @@ impl fmt::Display for Aggregate {
             Self::Vlad(vlad) => {
                 let mut hasher = Sha256::new();
                 self.hash_into(&mut hasher);
-                write!(f, "vlad{}-{}", vlad.count(), &hex::encode(hasher.finalize())[..8])
+                write!(
+                    f,
+                    "vlad{}-{}",
+                    vlad.count(),
+                    &hex::encode(hasher.finalize())[..8]
+                )
             }
         }
     }

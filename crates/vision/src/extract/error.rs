@@ -1,8 +1,8 @@
 //! Everything that can go wrong between a normalised image and its descriptor.
 
 use placeformer_core::error::ErrorCode;
-use placeformer_kernels::SimdError;
 use placeformer_core::types::{ImageSize, InvalidValue};
+use placeformer_kernels::SimdError;
 use std::path::PathBuf;
 
 /// Why extraction, or loading what it needs, failed.

@@ -1,6 +1,5 @@
 //! Weights, head and settings put together: from normalised images to descriptors.
 
-use crate::extract::pack;
 use super::aggregate::Aggregate;
 use super::config::{ExtractConfig, HeadChoice};
 use super::encoder::{EncodedImage, Encoder, EncoderSpec, Precision, check_image, token_grid};
@@ -11,6 +10,7 @@ use super::preset::Geometry;
 use super::trace::ExtractionTrace;
 use super::weights::VitWeights;
 use super::{fusion, model_id, positions, record, selection};
+use crate::extract::pack;
 
 use placeformer_core::types::{
     Descriptor, ImageSize, ImageTensor, InvalidValue, KeyPatches, ModelId, PatchGrid,

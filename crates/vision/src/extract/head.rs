@@ -20,7 +20,9 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 /// Heads that ship, one per backbone.
-const BUILT_IN: [&[u8]; 1] = [include_bytes!("../../../../models/dinov2-vits14-b8.safetensors")];
+const BUILT_IN: [&[u8]; 1] = [include_bytes!(
+    "../../../../models/dinov2-vits14-b8.safetensors"
+)];
 
 /// A projection d -> 256, and the pooling before it.
 #[derive(Debug, Clone, PartialEq)]

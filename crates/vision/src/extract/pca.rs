@@ -8,8 +8,8 @@
 use super::aggregate::Aggregate;
 use super::error::ExtractError;
 use super::head::Head;
-use placeformer_core::types::GLOBAL_DIM;
 use nalgebra::{DMatrix, SymmetricEigen};
+use placeformer_core::types::GLOBAL_DIM;
 use std::collections::BTreeMap;
 
 /// Mean and covariance of vectors seen one at a time (Welford's update, in f64).

@@ -11,9 +11,9 @@ use super::error::ExtractError;
 use super::positions;
 use super::preset::{Geometry, LAYER_NORM_EPS};
 use super::weights::{BlockWeights, Linear, Norm, VitWeights};
-use placeformer_core::types::ImageTensor;
 use candle_core::{CpuStorage, D, Device, InplaceOp1, Layout, Tensor};
 use candle_nn::ops::{layer_norm, softmax_last_dim};
+use placeformer_core::types::ImageTensor;
 use rayon::prelude::*;
 
 type Result<T> = std::result::Result<T, candle_core::Error>;

@@ -2,10 +2,10 @@
 
 use super::header::{self, Format};
 use super::{ImageConfig, ImageError, RgbImage};
-use placeformer_core::types::ImageSize;
 use ::image::codecs::{png::PngDecoder, webp::WebPDecoder};
 use ::image::metadata::Orientation;
 use ::image::{DynamicImage, ImageDecoder, Limits};
+use placeformer_core::types::ImageSize;
 use std::io::Cursor;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use zune_core::bytestream::ZCursor;

@@ -4,9 +4,9 @@
 //! EXIF is often missing and often broken, so nothing here fails: a tag that is absent, malformed
 //! or out of range is simply not there.
 
-use placeformer_core::types::{GeoPoint, Heading};
 use ::exif::{Exif, In, Rational, Reader, Tag, Value};
 use ::image::metadata::Orientation;
+use placeformer_core::types::{GeoPoint, Heading};
 use std::io::Cursor;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use time::{Date, Month, OffsetDateTime, PrimitiveDateTime, Time, UtcOffset};

@@ -2,9 +2,9 @@
 //! image.
 
 use super::{ImageError, RgbImage};
-use placeformer_core::types::{ImageSize, ImageTensor};
 use fast_image_resize::images::{Image, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
+use placeformer_core::types::{ImageSize, ImageTensor};
 
 /// ImageNet mean of R, G, B.
 pub const MEAN: [f32; 3] = [0.485, 0.456, 0.406];

@@ -17,9 +17,9 @@ mod score;
 #[cfg(test)]
 mod tests;
 
-use placeformer_kernels::simd::{self, Simd};
-use placeformer_core::types::{Deadline, InvalidValue, PackedPatches, RerankId, ScaleSet};
 use mutual_nn::PreparedQuery;
+use placeformer_core::types::{Deadline, InvalidValue, PackedPatches, RerankId, ScaleSet};
+use placeformer_kernels::simd::{self, Simd};
 use rayon::prelude::*;
 use score::{with_prepared, with_workspace};
 use serde::{Deserialize, Serialize};

@@ -5,9 +5,9 @@
 //! ([`placeformer_kernels::similarity`]), however many of the configured unions contain it; a union then
 //! takes the best over its blocks.
 
+use placeformer_core::types::{PackedPatches, SCALES, ScaleSet};
 use placeformer_kernels::Simd;
 use placeformer_kernels::similarity::{self, Best, BlockMaxima, Blocks, PackedColumns, Quantised};
-use placeformer_core::types::{PackedPatches, SCALES, ScaleSet};
 
 /// A mutual pair: row in the query's patches, row in the reference's.
 pub(super) type Pair = (u32, u32);

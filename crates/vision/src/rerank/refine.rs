@@ -5,8 +5,8 @@
 //! residuals are divided by the previous estimate's `w`, which makes them the transfer error that
 //! inliers are judged by.
 
-use placeformer_kernels::homography::PointPairs;
 use nalgebra::{SMatrix, SVector};
+use placeformer_kernels::homography::PointPairs;
 
 /// Fits the correspondences whose transfer error under `homography` is within `radius` tolerances.
 ///

@@ -4,8 +4,8 @@
 use super::mutual_nn::{Matcher, Pair, PreparedQuery, centres_of};
 use super::ransac::{Estimate, Ransac, RansacSettings, is_inlier};
 use super::{CombinationMatch, CombinationScore, Correspondence, PairScore, RerankConfig};
-use placeformer_kernels::Simd;
 use placeformer_core::types::{PackedPatches, ScaleSet};
+use placeformer_kernels::Simd;
 use std::cell::RefCell;
 
 /// What one thread needs to score a pair; kept from pair to pair.

@@ -2,10 +2,10 @@
 
 mod parity;
 
-use crate::extract::pack;
 use super::mutual_nn::{Matcher, PreparedQuery};
 use super::ransac::{Estimate, Ransac, RansacSettings};
 use super::*;
+use crate::extract::pack;
 use placeformer_core::types::{KeyPatches, PatchGrid, PoolingStride, ScaleKeyPatches};
 use proptest::prelude::*;
 use std::path::Path;
@@ -277,10 +277,7 @@ fn golden_descriptors_have_the_golden_mutual_pairs() {
             golden_patches(&pair.query, pair.size),
             golden_patches(&pair.reference, pair.size),
         );
-        let (packed_query, packed_reference) = (
-            pack(&query),
-            pack(&reference),
-        );
+        let (packed_query, packed_reference) = (pack(&query), pack(&reference));
         for (name, golden) in &pair.scores {
             let scales: ScaleSet = name.parse().unwrap();
             let joined = |patches: &KeyPatches| -> Vec<f32> {

@@ -2,9 +2,9 @@
 
 use super::IndexEntry;
 use super::filter::{Extent, PlaceAndTime};
+use placeformer_core::types::{GLOBAL_DIM, ReferenceId};
 use placeformer_kernels::scan::{Codes, LENGTH, Rows};
 use placeformer_kernels::{quantise, simd};
-use placeformer_core::types::{GLOBAL_DIM, ReferenceId};
 
 const _: () = assert!(LENGTH == GLOBAL_DIM);
 

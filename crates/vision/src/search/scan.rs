@@ -32,9 +32,9 @@
 use super::Neighbour;
 use super::block::{Block, Quantised, Sealed};
 use super::filter::Sieve;
+use placeformer_core::types::ReferenceId;
 use placeformer_kernels::scan::{Bounds, GROUP, Probe, bounds, dot_products, next_near};
 use placeformer_kernels::{Simd, simd};
-use placeformer_core::types::ReferenceId;
 use std::cell::RefCell;
 use std::collections::BinaryHeap;
 use std::sync::atomic::{AtomicU32, Ordering};

@@ -1,8 +1,8 @@
 //! What is done to key patches after extraction, so that rows of a table can share one.
 
 use super::EvalError;
-use placeformer_core::types::{PackedPatches, SCALES};
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
+use placeformer_core::types::{PackedPatches, SCALES};
 
 /// What is done to key patches after extraction.
 #[derive(Debug, Clone, Copy, PartialEq)]

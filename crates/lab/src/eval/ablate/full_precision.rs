@@ -5,15 +5,14 @@
 //! once more and held in memory. The similarities are a plain matrix product; pairs are verified by
 //! the same homographies.
 
-use placeformer_vision::extract::pack;
 use super::EvalError;
 use crate::datasets::{Dataset, Item};
 use crate::eval::features::Describe;
 use crate::eval::run::{Answer, Candidate, Neighbour};
-use placeformer_vision::rerank::{CombinationScore, PairScore, RerankConfig, Reranker};
-use placeformer_core::types::{KeyPatches, SCALES, ScaleSet};
 use indicatif::ProgressBar;
 use nalgebra::DMatrix;
+use placeformer_core::types::{KeyPatches, SCALES, ScaleSet};
+use placeformer_vision::rerank::{CombinationScore, PairScore, RerankConfig, Reranker};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
@@ -209,7 +208,8 @@ fn mutual_pairs(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use placeformer_core::types::{PackedPatches, PatchGrid, PoolingStride, ScaleKeyPatches};
+    use placeformer_core::types::{PatchGrid, PoolingStride, ScaleKeyPatches};
+    use placeformer_vision::extract::pack;
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
@@ -262,10 +262,7 @@ mod tests {
         let reranker = Reranker::new(RerankConfig::default());
         let (a, b) = (Whole::of(&query), Whole::of(&reference));
         let full = a.score(&a.descriptors.transpose(), &b, &reranker);
-        let packed = reranker.score(
-            &pack(&query),
-            &pack(&reference),
-        );
+        let packed = reranker.score(&pack(&query), &pack(&reference));
         assert_eq!(full, packed);
         assert!(full.combinations[0].inliers >= 45, "{full:?}");
     }

@@ -3,11 +3,11 @@
 use super::cuts::{coarsen, limit};
 use super::*;
 use crate::datasets::Item;
+use half::f16;
 use placeformer_core::types::{
     ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid,
     PoolingStride, ScaleKeyPatches,
 };
-use half::f16;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

@@ -12,8 +12,8 @@
 //! it would keep its promise by construction.
 
 use super::folds::folds_of;
-use placeformer_core::types::{ConfidenceCurve, ConfidenceWeights};
 use nalgebra::{Matrix3, Vector3};
+use placeformer_core::types::{ConfidenceCurve, ConfidenceWeights};
 use serde::Serialize;
 use std::collections::BTreeSet;
 

@@ -2,9 +2,9 @@
 //! re-ranking, and what the key patches saw (the paper's visualisation figure).
 
 use super::html::escape;
+use crate::datasets::{Dataset, Item, Truth};
 use crate::draw::{jpeg_data_uri, thumbnail};
 use crate::eval::EvalError;
-use crate::datasets::{Dataset, Item, Truth};
 use crate::eval::evidence::{Seen, picture};
 use crate::eval::measure::first_hit;
 use crate::eval::run::Answer;

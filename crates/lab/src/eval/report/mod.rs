@@ -15,10 +15,10 @@ pub use svg::{Histogram, LineChart, Series};
 pub use text::text;
 
 use super::calibrate::Applied;
-use super::datasets::Dataset;
 use super::measure::RECALL_AT;
 use super::run::Answer;
 use super::summary::{AtK, GroupSummary, Summary};
+use crate::datasets::Dataset;
 
 /// The whole page. `left_out` are answers that cannot be right, because the query's place was left
 /// out. `details` is HTML that follows the plots: single queries as pictures, an ablation table, or

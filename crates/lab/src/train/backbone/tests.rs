@@ -2,13 +2,15 @@
 //! run on drawn places.
 
 use super::*;
-use placeformer_vision::extract::{BlockWeights, CandleEncoder, Encoder, Geometry, Linear, Norm, Preset};
-use placeformer_vision::image::{RgbImage, encode_png};
 use crate::synth::{Condition, StreetWorld, Viewpoint};
 use crate::train::loss::triplet_margin_loss;
 use crate::train::triplets::Side;
 use crate::train::{Progress, Schedule};
 use placeformer_core::types::ImageSize;
+use placeformer_vision::extract::{
+    BlockWeights, CandleEncoder, Encoder, Geometry, Linear, Norm, Preset,
+};
+use placeformer_vision::image::{RgbImage, encode_png};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

@@ -8,7 +8,9 @@ use placeformer_kernels::aligned::AlignedBuffer;
 use placeformer_kernels::attention::{
     AttentionShape, Place, attend, store_key_codes, store_keys, store_query_codes, store_values,
 };
-use placeformer_kernels::elementwise::{Epilogue, Product, finish_block, finish_words, normalize_rows};
+use placeformer_kernels::elementwise::{
+    Epilogue, Product, finish_block, finish_words, normalize_rows,
+};
 use placeformer_kernels::gemm::{Tiling, multiply_panel};
 use placeformer_kernels::operand::{Format, Left, OperandBuffer, Rows};
 use std::ops::Range;

@@ -14,8 +14,8 @@ use crate::extract::encoder::EncoderSpec;
 use crate::extract::error::ExtractError;
 use crate::extract::vit::{BlockLayer, CandleEncoder};
 use crate::extract::weights::{Norm, VitWeights};
-use placeformer_core::types::{ImageSize, ImageTensor};
 use half::bf16;
+use placeformer_core::types::{ImageSize, ImageTensor};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

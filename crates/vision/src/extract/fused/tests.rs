@@ -4,8 +4,8 @@ use super::*;
 use crate::extract::CandleEncoder;
 use crate::extract::preset::Preset;
 use crate::extract::weights::{BlockWeights, Linear};
-use placeformer_kernels::SimdLevel;
 use placeformer_core::types::ImageSize;
+use placeformer_kernels::SimdLevel;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
