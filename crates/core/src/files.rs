@@ -5,7 +5,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-/// SHA-256 of a file in lower-case hexadecimal. The file is read in pieces.
+/// SHA-256 of a file in lower-case hexadecimal. The file is streamed, not loaded whole.
 ///
 /// # Errors
 /// The file cannot be opened or read.
@@ -15,19 +15,20 @@ pub fn hash_file(path: &Path) -> io::Result<String> {
     Ok(hex::encode(hasher.finalize()))
 }
 
-/// Writes `bytes` beside `path`, syncs, and renames into place: after a crash there is the old file
-/// or the new one, and never a part of one.
+/// Writes `bytes` to a temporary file in the same directory, syncs it, and renames it to `path`.
+/// After a crash there is the old file or the new one, and never a part of one.
 ///
 /// # Errors
 /// The directory cannot be written to, or the disk is full. The old file is then untouched.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let part = with_suffix(path, &format!(".{}.part", std::process::id()));
-    write_and_sync(&part, bytes)
-        .and_then(|()| rename_durably(&part, path))
-        .inspect_err(|_| {
-            // The unfinished file is of no use to anyone, and the caller needs the first error.
-            let _ = fs::remove_file(&part);
-        })
+    let written = write_and_sync(&part, bytes).and_then(|()| rename_durably(&part, path));
+    if written.is_err() {
+        // The unfinished file is of no use to anyone. The caller needs the first error, so a
+        // failure to remove it is not reported.
+        let _ = fs::remove_file(&part);
+    }
+    written
 }
 
 fn write_and_sync(path: &Path, bytes: &[u8]) -> io::Result<()> {
@@ -42,11 +43,23 @@ fn write_and_sync(path: &Path, bytes: &[u8]) -> io::Result<()> {
 /// The system refuses to rename the file or to sync the directory.
 pub fn rename_durably(from: &Path, to: &Path) -> io::Result<()> {
     fs::rename(from, to)?;
-    let directory = match to.parent() {
+    sync_directory(directory_of(to))
+}
+
+/// Syncs a directory, so that names created, renamed or removed in it survive a power cut.
+///
+/// # Errors
+/// The directory cannot be opened or synced.
+pub fn sync_directory(directory: &Path) -> io::Result<()> {
+    File::open(directory)?.sync_all()
+}
+
+/// The directory that a file lies in: `.` for a bare file name.
+pub fn directory_of(path: &Path) -> &Path {
+    match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
-    };
-    File::open(directory)?.sync_all()
+    }
 }
 
 /// `path` with `suffix` appended to its file name.
@@ -61,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_is_replaced_whole_and_leaves_nothing_beside_it() {
+    fn a_file_is_replaced_whole_and_no_other_file_is_left() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("head.bin");
         for content in [&b"first"[..], b"second"] {
@@ -80,6 +93,12 @@ mod tests {
         assert!(write_atomically(&path, b"new").is_err());
         assert!(path.join("inside").exists());
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_bare_file_name_lies_in_the_current_directory() {
+        assert_eq!(directory_of(Path::new("head.bin")), Path::new("."));
+        assert_eq!(directory_of(Path::new("a/head.bin")), Path::new("a"));
     }
 
     #[test]

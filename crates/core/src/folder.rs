@@ -1,7 +1,7 @@
 //! Finds images on disk, in an order that does not depend on the file system.
 
 use std::path::{Path, PathBuf};
-use walkdir::WalkDir;
+use walkdir::{DirEntry, WalkDir};
 
 /// A folder, or something in it, could not be read.
 #[derive(Debug, thiserror::Error)]
@@ -13,59 +13,58 @@ pub struct FolderError {
     pub source: std::io::Error,
 }
 
+/// File name endings of images, in lower case.
 const EXTENSIONS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
 
 /// Every image below `folder` as (name, path), by name. The name is the path below `folder` with
 /// `/` on every system.
 ///
-/// Hidden files and folders are not looked at: file managers leave previews there.
+/// Links are followed. Hidden files and folders are not looked at, because file managers leave
+/// previews there.
+///
+/// # Errors
+/// The folder or something below it cannot be read.
 pub fn list_images(folder: &Path) -> Result<Vec<(String, PathBuf)>, FolderError> {
-    let visible = |entry: &walkdir::DirEntry| {
-        entry.depth() == 0
-            || !entry
-                .file_name()
-                .to_str()
-                .is_some_and(|name| name.starts_with('.'))
-    };
-    let mut images = Vec::new();
-    for entry in WalkDir::new(folder)
+    let entries = WalkDir::new(folder)
         .follow_links(true)
         .into_iter()
-        .filter_entry(visible)
-    {
-        let entry = entry.map_err(|error| {
-            let path = error.path().unwrap_or(folder).to_owned();
-            FolderError {
-                path,
-                source: error.into(),
-            }
+        .filter_entry(is_visible);
+    let mut images = Vec::new();
+    for entry in entries {
+        let entry = entry.map_err(|error| FolderError {
+            path: error.path().unwrap_or(folder).to_owned(),
+            source: error.into(),
         })?;
         if entry.file_type().is_file() && is_image(entry.path()) {
-            images.push((relative_name(folder, entry.path()), entry.into_path()));
+            let name = relative_name(folder, entry.path());
+            images.push((name, entry.into_path()));
         }
     }
     images.sort_unstable();
     Ok(images)
 }
 
-/// The path below `folder`, with `/` on every system.
+/// Whether an entry is the folder asked for, or not hidden.
+fn is_visible(entry: &DirEntry) -> bool {
+    let is_root = entry.depth() == 0;
+    let name = entry.file_name().as_encoded_bytes();
+    is_root || !name.starts_with(b".")
+}
+
+/// The path below `folder`, with `/` on every system; the whole path if it lies elsewhere.
 pub fn relative_name(folder: &Path, path: &Path) -> String {
     let below = path.strip_prefix(folder).unwrap_or(path);
-    below
-        .iter()
-        .map(|part| part.to_string_lossy())
-        .collect::<Vec<_>>()
-        .join("/")
+    let parts: Vec<_> = below.iter().map(|part| part.to_string_lossy()).collect();
+    parts.join("/")
 }
 
 fn is_image(path: &Path) -> bool {
-    path.extension()
-        .and_then(|extension| extension.to_str())
-        .is_some_and(|extension| {
-            EXTENSIONS
-                .iter()
-                .any(|known| extension.eq_ignore_ascii_case(known))
-        })
+    let Some(extension) = path.extension().and_then(|extension| extension.to_str()) else {
+        return false;
+    };
+    EXTENSIONS
+        .iter()
+        .any(|known| known.eq_ignore_ascii_case(extension))
 }
 
 #[cfg(test)]

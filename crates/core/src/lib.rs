@@ -5,11 +5,15 @@
 //! | [`types`] | the nouns: identifiers, locations, descriptors, references |
 //! | [`error`] | the one table of error codes |
 //! | [`files`] | files that are written whole or not at all, and their hashes |
-//! | [`geography`] | UTM zones and the image names that carry UTM positions |
+//! | [`geography`] | positions, headings, UTM zones, and image names that carry UTM positions |
 //! | [`folder`] | the images below a folder |
+//!
+//! Every other crate depends on this one and it depends on none of them. Nothing here decides how
+//! the service behaves. Only [`files`] and [`folder`] touch the disk.
 
 pub mod error;
 pub mod files;
 pub mod folder;
 pub mod geography;
+mod invalid;
 pub mod types;

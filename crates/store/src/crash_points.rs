@@ -1,23 +1,26 @@
 //! Named places at which the process can be made to die, for tests of durability.
 //!
 //! A store is only as good as its behaviour when the power goes between two writes. Tests therefore
-//! start the real process with `PLACEFORMER_CRASH_AT=name` or `name:nth` and it aborts, without
-//! unwinding or flushing anything, when that place is reached (for the nth time, counting from 1).
-//! Without the variable a place costs one load.
+//! start a real process with `PLACEFORMER_CRASH_AT=name` or `name:nth`. The process aborts, without
+//! unwinding or flushing anything, when it reaches that place (for the nth time, counting from 1).
+//!
+//! An environment variable must never be able to stop a production server. So the places exist only
+//! with the cargo feature `crash-points`, which tests turn on and which release builds lack. Without
+//! it the variable is never read and reaching a place compiles to nothing.
 
-use std::sync::OnceLock;
-use std::sync::atomic::{AtomicU64, Ordering};
-
-/// The environment variable that arms a crash point.
+/// The environment variable that names the place to die at.
 pub const VARIABLE: &str = "PLACEFORMER_CRASH_AT";
 
-/// Jobs are at hand, no transaction is open yet.
+/// Whether this build has the places at all, that is, the feature `crash-points`.
+pub const ENABLED: bool = cfg!(feature = "crash-points");
+
+/// Jobs wait to be written, no transaction is open yet.
 pub const BEFORE_BEGIN: &str = "before_begin";
 /// A reference's metadata row is written, its descriptor is not.
 pub const MID_INSERT: &str = "mid_insert";
 /// Every job of the group has written, nothing is committed.
 pub const BEFORE_COMMIT: &str = "before_commit";
-/// The group is durable, nobody has been told.
+/// The group is durable, its callers have not been answered.
 pub const AFTER_COMMIT: &str = "after_commit";
 /// A map is marked as deleted, its references still lie on disk.
 pub const MAP_DELETED: &str = "map_deleted";
@@ -40,51 +43,66 @@ pub const ALL: &[&str] = &[
     MID_MIGRATION,
 ];
 
-struct Armed {
-    name: String,
-    left: AtomicU64,
-}
+/// Does nothing: this build has no crash points.
+#[cfg(not(feature = "crash-points"))]
+#[inline(always)]
+pub(crate) fn reach(_name: &str) {}
 
-fn armed() -> Option<&'static Armed> {
-    static ARMED: OnceLock<Option<Armed>> = OnceLock::new();
-    ARMED
-        .get_or_init(|| std::env::var(VARIABLE).ok().map(|setting| parse(&setting)))
-        .as_ref()
-}
+#[cfg(feature = "crash-points")]
+pub(crate) use armed::reach;
 
-fn parse(setting: &str) -> Armed {
-    let (name, nth) = setting.split_once(':').unwrap_or((setting, "1"));
-    Armed {
-        name: name.to_owned(),
-        left: AtomicU64::new(nth.parse().unwrap_or(1)),
+#[cfg(feature = "crash-points")]
+mod armed {
+    use super::VARIABLE;
+    use std::sync::OnceLock;
+    use std::sync::atomic::{AtomicU64, Ordering};
+
+    /// The place named by the environment variable.
+    struct Armed {
+        name: String,
+        /// How many times it is still to be reached, the last of which is fatal.
+        remaining: AtomicU64,
     }
-}
 
-/// Dies here if this place is the armed one and its turn has come.
-pub(super) fn reach(name: &str) {
-    if let Some(armed) = armed()
-        && armed.name == name
-        && armed.left.fetch_sub(1, Ordering::Relaxed) == 1
-    {
-        std::process::abort();
+    impl Armed {
+        fn parse(setting: &str) -> Self {
+            let (name, nth) = setting.split_once(':').unwrap_or((setting, "1"));
+            Self {
+                name: name.to_owned(),
+                remaining: AtomicU64::new(nth.parse().unwrap_or(1)),
+            }
+        }
+
+        /// Counts one arrival at `name`; true for the one at which the process has to die.
+        fn is_due(&self, name: &str) -> bool {
+            self.name == name && self.remaining.fetch_sub(1, Ordering::Relaxed) == 1
+        }
     }
-}
 
-#[cfg(test)]
-mod tests {
-    use super::*;
+    /// Dies here if this is the place named by the environment, reached often enough.
+    pub(crate) fn reach(name: &str) {
+        static ARMED: OnceLock<Option<Armed>> = OnceLock::new();
+        let armed = ARMED.get_or_init(|| {
+            let setting = std::env::var(VARIABLE).ok()?;
+            Some(Armed::parse(&setting))
+        });
+        if armed.as_ref().is_some_and(|armed| armed.is_due(name)) {
+            std::process::abort();
+        }
+    }
 
-    #[test]
-    fn settings_name_a_place_and_optionally_its_turn() {
-        let first = parse("before_commit");
-        assert_eq!(
-            (first.name.as_str(), first.left.into_inner()),
-            ("before_commit", 1)
-        );
-        let third = parse("mid_purge:3");
-        assert_eq!(
-            (third.name.as_str(), third.left.into_inner()),
-            ("mid_purge", 3)
-        );
+    #[cfg(test)]
+    mod tests {
+        use super::*;
+
+        #[test]
+        fn a_setting_names_a_place_and_optionally_how_often_it_is_reached() {
+            let first = Armed::parse("before_commit");
+            assert!(!first.is_due("mid_purge"));
+            assert!(first.is_due("before_commit"));
+            let third = Armed::parse("mid_purge:3");
+            let due = [(); 4].map(|()| third.is_due("mid_purge"));
+            assert_eq!(due, [false, false, true, false]);
+        }
     }
 }

@@ -25,14 +25,15 @@ pub enum StoreError {
     },
     /// The external id belongs to a reference with other content.
     #[error(
-        "external id {external_id} of map {map} belongs to reference {existing}, which has other content"
+        "external id {external_id} of map {map} belongs to reference {existing}, \
+         which has other content"
     )]
     ExternalIdConflict {
         /// The map.
         map: MapName,
-        /// The contested name.
+        /// The external id that both claim.
         external_id: ExternalId,
-        /// Who has it.
+        /// The reference that it belongs to.
         existing: ReferenceId,
     },
     /// The map was built with another model.
@@ -55,12 +56,13 @@ pub enum StoreError {
         /// The model of the calibration offered.
         given: ModelId,
     },
-    /// A reference fails its checksum; it is quarantined.
+    /// A reference fails its checksum or cannot be read; it is quarantined.
     #[error(
-        "reference {id} is damaged on disk and quarantined: {reason}; delete it or send its image again"
+        "reference {id} is damaged on disk and quarantined: {reason}; \
+         delete it or send its image again"
     )]
-    Corrupt {
-        /// Which.
+    CorruptRecord {
+        /// The damaged reference.
         id: ReferenceId,
         /// What is wrong with it.
         reason: String,
@@ -73,7 +75,8 @@ pub enum StoreError {
     },
     /// The head that a map keeps for itself fails its checksum.
     #[error(
-        "the head that map {map} keeps is damaged on disk; give it a head again, its references are whole"
+        "the head that map {map} keeps is damaged on disk; \
+         give it a head again, its references are whole"
     )]
     CorruptHead {
         /// The map.
@@ -81,7 +84,8 @@ pub enum StoreError {
     },
     /// A part of the database that belongs to no single record is damaged.
     #[error(
-        "the database is damaged, noticed while {context}: {source}; check the stopped store, or restore a backup"
+        "the database is damaged, noticed while {context}: {source}; \
+         check the stopped store, or restore a backup"
     )]
     Damaged {
         /// What was being done.
@@ -89,10 +93,10 @@ pub enum StoreError {
         /// What the engine said.
         source: EngineCause,
     },
-    /// The descriptor offered breaks a rule of its type: a fault of the caller.
+    /// The descriptor offered breaks a rule of its type, which is a fault of the caller.
     #[error("the descriptor cannot be stored: {reason}")]
     InvalidDescriptor {
-        /// Which rule.
+        /// Which rule it breaks.
         reason: String,
     },
     /// No space is left for writing; reading and deleting still work.
@@ -108,7 +112,8 @@ pub enum StoreError {
     },
     /// The database was written by a newer release.
     #[error(
-        "the database has schema version {found}, this release knows up to {supported}: use a newer release"
+        "the database has schema version {found}, this release knows up to {supported}: \
+         use a newer release"
     )]
     SchemaTooNew {
         /// Version on disk.
@@ -118,7 +123,8 @@ pub enum StoreError {
     },
     /// A migration that was applied is not the one this release carries.
     #[error(
-        "migration {version} was applied with other content than this release carries; the database is not ours"
+        "migration {version} was applied with other content than this release carries; \
+         the database is not ours"
     )]
     MigrationChanged {
         /// Its number.
@@ -174,7 +180,7 @@ impl StoreError {
             Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
             Self::ModelMismatch { .. } => ErrorCode::ModelMismatch,
             Self::CalibrationMismatch { .. } => ErrorCode::CalibrationMismatch,
-            Self::Corrupt { .. }
+            Self::CorruptRecord { .. }
             | Self::CorruptMap { .. }
             | Self::CorruptHead { .. }
             | Self::Damaged { .. } => ErrorCode::CorruptRecord,

@@ -1,6 +1,6 @@
 //! Positions on the Earth.
 
-use crate::types::InvalidValue;
+use crate::invalid::InvalidValue;
 use serde::{Deserialize, Serialize};
 
 /// Mean Earth radius in metres (IUGG R1).
@@ -63,7 +63,8 @@ impl GeoPoint {
 
     /// Great-circle distance in metres (haversine).
     pub fn distance_m(self, other: Self) -> f64 {
-        let (lat_a, lat_b) = (self.lat.to_radians(), other.lat.to_radians());
+        let lat_a = self.lat.to_radians();
+        let lat_b = other.lat.to_radians();
         let half_lat = ((lat_b - lat_a) / 2.0).sin();
         let half_lon = ((other.lon - self.lon).to_radians() / 2.0).sin();
         let chord = half_lat * half_lat + lat_a.cos() * lat_b.cos() * half_lon * half_lon;

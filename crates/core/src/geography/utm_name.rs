@@ -1,11 +1,14 @@
-//! Names that carry their own metadata:
-//! `@utm_east@utm_north@zone@band@lat@lon@pano@tile@heading@pitch@roll@height@ time@note@.jpg`, the
-//! convention of the common visual place recognition benchmarks.
+//! Image names that carry their own metadata, the convention of the common visual place recognition
+//! benchmarks:
+//!
+//! ```text
+//! @utm_east@utm_north@zone@band@lat@lon@pano@tile@heading@pitch@roll@height@time@note@.jpg
+//! ```
 //!
 //! Only the first two fields must be there; the rest may be empty or absent.
 
 use super::{GeoPoint, Heading, MetricPoint, UtmZone};
-use crate::types::InvalidValue;
+use crate::invalid::InvalidValue;
 use time::{Date, Month, OffsetDateTime, PrimitiveDateTime, Time};
 
 /// What a name says.
@@ -30,35 +33,27 @@ impl UtmName {
     pub fn parse(name: &str) -> Result<Self, InvalidValue> {
         let file = name.rsplit('/').next().unwrap_or(name);
         let wrong = |what: &str| InvalidValue::new("name", format!("{file:?} {what}"));
-        let stem = file
-            .rsplit_once('.')
-            .filter(|(_, end)| is_extension(end))
-            .map_or(file, |(stem, _)| stem);
-        let mut fields = stem.split('@');
-        if fields.next() != Some("") {
+        let Some(fields) = Fields::of(file) else {
             return Err(wrong("does not start with @"));
-        }
-        let fields: Vec<&str> = fields.map(str::trim).collect();
-        let field = |index: usize| fields.get(index).copied().unwrap_or("");
-        let metres = |index: usize| {
-            field(index)
-                .parse::<f64>()
-                .ok()
-                .filter(|value| value.is_finite())
         };
-        let (Some(east), Some(north)) = (metres(0), metres(1)) else {
+        let east = fields.number(0).filter(|metres| metres.is_finite());
+        let north = fields.number(1).filter(|metres| metres.is_finite());
+        let (Some(east), Some(north)) = (east, north) else {
             return Err(wrong("does not begin with @utm_east@utm_north@"));
         };
-        let degrees = |index: usize| field(index).parse::<f64>().ok();
+        let lat = fields.number(4);
+        let lon = fields.number(5);
         Ok(Self {
             point: MetricPoint { east, north },
-            zone: UtmZone::new(field(2), field(3)),
-            geo: degrees(4)
-                .zip(degrees(5))
+            zone: UtmZone::new(fields.text(2), fields.text(3)),
+            geo: lat
+                .zip(lon)
                 .and_then(|(lat, lon)| GeoPoint::new(lat, lon).ok()),
-            pano_id: field(6).to_owned(),
-            heading: degrees(8).and_then(|angle| Heading::new(angle).ok()),
-            captured_at: parse_time(field(12)),
+            pano_id: fields.text(6).to_owned(),
+            heading: fields
+                .number(8)
+                .and_then(|degrees| Heading::new(degrees).ok()),
+            captured_at: parse_time(fields.text(12)),
         })
     }
 
@@ -72,6 +67,33 @@ impl UtmName {
     }
 }
 
+/// The parts between the `@` of a file name, without its extension.
+struct Fields<'a>(Vec<&'a str>);
+
+impl<'a> Fields<'a> {
+    /// Splits a file name; `None` if it does not start with `@`.
+    fn of(file: &'a str) -> Option<Self> {
+        let stem = match file.rsplit_once('.') {
+            Some((stem, end)) if is_extension(end) => stem,
+            _ => file,
+        };
+        let fields = stem.strip_prefix('@')?.split('@');
+        Some(Self(fields.map(str::trim).collect()))
+    }
+
+    /// A field as text, counted from 0; empty if the name ends before it.
+    fn text(&self, index: usize) -> &'a str {
+        self.0.get(index).copied().unwrap_or("")
+    }
+
+    /// A field as a number; none if it is absent or something else.
+    fn number(&self, index: usize) -> Option<f64> {
+        self.text(index).parse().ok()
+    }
+}
+
+/// Whether what follows the last dot of a name is an extension, rather than the decimals of a
+/// coordinate.
 fn is_extension(text: &str) -> bool {
     !text.is_empty()
         && text.chars().all(|c| c.is_ascii_alphanumeric())

@@ -1,7 +1,7 @@
 //! Zones of the Universal Transverse Mercator grid, and points on it.
 
 use super::GeoPoint;
-use crate::types::InvalidValue;
+use crate::invalid::InvalidValue;
 
 /// A point on a plane, in metres east and north of the plane's origin.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -11,6 +11,9 @@ pub struct MetricPoint {
     /// Metres north.
     pub north: f64,
 }
+
+/// Letters of the latitude bands, south to north.
+const BANDS: &str = "CDEFGHJKLMNPQRSTUVWX";
 
 /// A zone and latitude band of the Universal Transverse Mercator grid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -32,16 +35,19 @@ impl std::str::FromStr for UtmZone {
                 format!("{text:?} is not a zone and band such as 33T"),
             )
         };
-        let (split, band) = text.char_indices().next_back().ok_or_else(wrong)?;
-        Self::new(&text[..split], &band.to_string()).ok_or_else(wrong)
+        let (band_start, _) = text.char_indices().next_back().ok_or_else(wrong)?;
+        let (number, band) = text.split_at(band_start);
+        Self::new(number, band).ok_or_else(wrong)
     }
 }
 
 impl UtmZone {
+    /// The zone of a number and a band given as text; none if either is not one.
     pub(super) fn new(number: &str, band: &str) -> Option<Self> {
-        let number = number.parse().ok().filter(|n| (1..=60).contains(n))?;
+        let number = number.parse().ok()?;
         let band = band.chars().next()?.to_ascii_uppercase();
-        ("CDEFGHJKLMNPQRSTUVWX".contains(band)).then_some(Self { number, band })
+        let is_zone = (1..=60).contains(&number) && BANDS.contains(band);
+        is_zone.then_some(Self { number, band })
     }
 
     /// The zone a position lies in; none beyond 80 degrees south and 84 north.
@@ -55,26 +61,29 @@ impl UtmZone {
 
     /// The position of grid coordinates in this zone.
     pub fn to_geo(self, point: MetricPoint) -> Option<GeoPoint> {
-        let inverse = |east, north| {
-            let (lat, lon) = utm::wsg84_utm_to_lat_lon(east, north, self.number, self.band).ok()?;
-            GeoPoint::new(lat, lon).ok()
+        let approximate = self.approximate_geo(point)?;
+        // The library's inverse is off by up to 0.6 m at the edge of a zone, while its forward
+        // direction is exact. So the forward direction measures the error of the first answer, and
+        // a second inverse of the point moved by that error is right to less than a millimetre.
+        let reached = self.from_geo(approximate);
+        let corrected = MetricPoint {
+            east: 2.0 * point.east - reached.east,
+            north: 2.0 * point.north - reached.north,
         };
-        let near = inverse(point.east, point.north)?;
-        // The library's inverse is off by up to 0.6 m at the edge of a zone, where neighbours of
-        // two zones meet. Its forward direction is exact, so one step back from where that lands
-        // leaves less than a millimetre.
-        let landed = self.from_geo(near);
-        let (east, north) = (
-            2.0 * point.east - landed.east,
-            2.0 * point.north - landed.north,
-        );
-        Some(inverse(east, north).unwrap_or(near))
+        Some(self.approximate_geo(corrected).unwrap_or(approximate))
+    }
+
+    /// The position of grid coordinates as the library's inverse projection gives it.
+    fn approximate_geo(self, point: MetricPoint) -> Option<GeoPoint> {
+        let (lat, lon) =
+            utm::wsg84_utm_to_lat_lon(point.east, point.north, self.number, self.band).ok()?;
+        GeoPoint::new(lat, lon).ok()
     }
 
     /// The grid coordinates of a position, continued into this zone wherever it lies.
     pub fn from_geo(self, position: GeoPoint) -> MetricPoint {
-        // Measured from the zone's own meridian, so that the date line does not tear neighbours
-        // apart.
+        // Longitude is counted from the zone's own meridian. Otherwise two neighbours on either
+        // side of the date line would lie 360 degrees apart.
         let meridian = f64::from(self.number) * 6.0 - 183.0;
         let lon = meridian + (position.lon() - meridian + 180.0).rem_euclid(360.0) - 180.0;
         let (north, east, _) = utm::to_utm_wgs84(position.lat(), lon, self.number);

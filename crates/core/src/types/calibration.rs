@@ -6,7 +6,8 @@
 //! holds; anywhere else its numbers mean nothing. As JSON it is a file, a column of the store and a
 //! body of the web surface alike.
 
-use super::{InvalidValue, ModelId, RerankId};
+use super::ids::{ModelId, RerankId};
+use crate::invalid::InvalidValue;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 

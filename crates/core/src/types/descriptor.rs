@@ -1,6 +1,6 @@
 //! What the model sees in one image: a global descriptor and key patches at three scales.
 
-use super::InvalidValue;
+use crate::invalid::InvalidValue;
 use half::f16;
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -39,10 +39,8 @@ impl FromStr for ImageSize {
             )
         };
         let (width, height) = text.split_once('x').ok_or_else(wrong)?;
-        let (width, height) = (
-            width.parse().map_err(|_| wrong())?,
-            height.parse().map_err(|_| wrong())?,
-        );
+        let width = width.parse().map_err(|_| wrong())?;
+        let height = height.parse().map_err(|_| wrong())?;
         if width == 0 || height == 0 {
             Err(wrong())
         } else {
@@ -61,7 +59,7 @@ pub struct ImageTensor {
     pub data: Vec<f32>,
 }
 
-/// How far apart fused windows lie (paper III-B is silent).
+/// How far apart fused windows lie; the paper (III-B) does not say.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum PoolingStride {
@@ -187,7 +185,7 @@ impl PackedPatches {
             .centre(self.scale_of(row), self.index[row] as usize)
     }
 
-    /// Bytes held on the heap.
+    /// Bytes on the heap.
     pub fn heap_bytes(&self) -> usize {
         self.index.len() * 2 + self.attention.len() * 2 + self.factor.len() * 4 + self.codes.len()
     }
@@ -274,14 +272,15 @@ impl FromStr for ScaleSet {
 
     /// Parses `1`, `1+2`, `2+3`, `1+2+3`, ...
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let scales: Result<Vec<usize>, _> =
-            text.split('+').map(|part| part.trim().parse()).collect();
-        Self::new(&scales.map_err(|_| {
-            InvalidValue::new(
-                "scales",
-                format!("{text:?} is not scales joined by +, such as 1+2"),
-            )
-        })?)
+        let mut scales = Vec::new();
+        for part in text.split('+') {
+            let scale = part.trim().parse().map_err(|_| {
+                let reason = format!("{text:?} is not scales joined by +, such as 1+2");
+                InvalidValue::new("scales", reason)
+            })?;
+            scales.push(scale);
+        }
+        Self::new(&scales)
     }
 }
 

@@ -1,21 +1,11 @@
 //! Identifiers, each checked where it enters.
 
+use crate::invalid::InvalidName;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 use std::fmt;
 use std::str::FromStr;
 use uuid::Uuid;
-
-/// A name that breaks its type's rule.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{kind} {value:?} is not valid: {rule}")]
-pub struct InvalidName {
-    /// What was being named ("map", "external id", ...).
-    pub kind: &'static str,
-    /// The offending text, cut to 80 characters.
-    pub value: String,
-    /// The rule it breaks.
-    pub rule: &'static str,
-}
 
 /// Identifies one reference for its whole life. Time-ordered (UUID version 7), so inserts append to
 /// indexes.
@@ -24,7 +14,7 @@ pub struct InvalidName {
 pub struct ReferenceId(Uuid);
 
 impl ReferenceId {
-    /// A fresh identifier.
+    /// A fresh identifier, greater than those generated earlier.
     pub fn generate() -> Self {
         Self(Uuid::now_v7())
     }
@@ -62,16 +52,6 @@ impl FromStr for ReferenceId {
     }
 }
 
-impl InvalidName {
-    fn new(kind: &'static str, value: &str, rule: &'static str) -> Self {
-        Self {
-            kind,
-            value: value.chars().take(80).collect(),
-            rule,
-        }
-    }
-}
-
 /// A map: a set of references searched together. 1 to 64 of `A-Z a-z 0-9 . _ -`, starting with a
 /// letter or digit.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -79,6 +59,8 @@ impl InvalidName {
 pub struct MapName(String);
 
 impl MapName {
+    /// Longest name in bytes, which are as many characters.
+    const LONGEST: usize = 64;
     const RULE: &'static str = "use 1 to 64 of A-Z a-z 0-9 . _ - and start with a letter or digit";
 
     /// The name as text.
@@ -87,15 +69,19 @@ impl MapName {
     }
 }
 
+impl MapName {
+    fn allows(character: char) -> bool {
+        character.is_ascii_alphanumeric() || matches!(character, '.' | '_' | '-')
+    }
+}
+
 impl FromStr for MapName {
     type Err = InvalidName;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let starts_well = text.starts_with(|c: char| c.is_ascii_alphanumeric());
-        let all_allowed = text
-            .chars()
-            .all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-'));
-        if starts_well && all_allowed && text.len() <= 64 {
+        let all_allowed = text.chars().all(Self::allows);
+        if starts_well && all_allowed && text.len() <= Self::LONGEST {
             Ok(Self(text.to_owned()))
         } else {
             Err(InvalidName::new("map", text, Self::RULE))
@@ -129,6 +115,10 @@ impl fmt::Display for MapName {
 pub struct ExternalId(String);
 
 impl ExternalId {
+    /// Longest name in bytes.
+    const LONGEST: usize = 256;
+    const RULE: &'static str = "use 1 to 256 bytes without control characters";
+
     /// The name as text.
     pub fn as_str(&self) -> &str {
         &self.0
@@ -139,14 +129,12 @@ impl FromStr for ExternalId {
     type Err = InvalidName;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        if text.is_empty() || text.len() > 256 || text.chars().any(char::is_control) {
-            return Err(InvalidName::new(
-                "external_id",
-                text,
-                "use 1 to 256 bytes without control characters",
-            ));
+        let has_valid_length = (1..=Self::LONGEST).contains(&text.len());
+        if has_valid_length && !text.chars().any(char::is_control) {
+            Ok(Self(text.to_owned()))
+        } else {
+            Err(InvalidName::new("external_id", text, Self::RULE))
         }
-        Ok(Self(text.to_owned()))
     }
 }
 
@@ -178,7 +166,7 @@ impl fmt::Display for ExternalId {
 pub struct ModelId(String);
 
 impl ModelId {
-    /// Wraps the text that `extract` composed or the store kept.
+    /// Wraps the text that extraction composed or the store returned.
     pub fn new(text: impl Into<String>) -> Self {
         Self(text.into())
     }
@@ -203,7 +191,7 @@ impl fmt::Display for ModelId {
 pub struct RerankId(String);
 
 impl RerankId {
-    /// Wraps the text that `rerank` composed or a calibration kept.
+    /// Wraps the text that re-ranking composed or a calibration carries.
     pub fn new(text: impl Into<String>) -> Self {
         Self(text.into())
     }
@@ -228,14 +216,13 @@ pub struct ContentHash(pub [u8; 32]);
 impl ContentHash {
     /// Hashes `bytes`.
     pub fn of(bytes: &[u8]) -> Self {
-        use sha2::Digest;
-        Self(sha2::Sha256::digest(bytes).into())
+        Self(Sha256::digest(bytes).into())
     }
 }
 
 impl fmt::Display for ContentHash {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+        f.write_str(&hex::encode(self.0))
     }
 }
 
@@ -251,6 +238,22 @@ mod tests {
         for bad in ["", ".hidden", "-x", "a/b", "a b", "é", &"x".repeat(65)] {
             assert!(bad.parse::<MapName>().is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn external_ids_reject_control_characters_and_excess_length() {
+        for good in ["a", "photos/1 é.jpg", &"x".repeat(256)] {
+            assert!(good.parse::<ExternalId>().is_ok(), "{good}");
+        }
+        for bad in ["", "a\nb", "\u{7f}", &"x".repeat(257)] {
+            assert!(bad.parse::<ExternalId>().is_err(), "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn a_content_hash_prints_as_hexadecimal() {
+        let expected = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
+        assert_eq!(ContentHash::of(b"abc").to_string(), expected);
     }
 
     #[test]

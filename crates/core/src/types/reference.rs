@@ -1,9 +1,8 @@
 //! A reference: one geo-tagged photo of a map, as its metadata.
 
-use super::{
-    ContentHash, Descriptor, ExternalId, GeoCircle, GeoPoint, Heading, MapName, ModelId,
-    ReferenceId,
-};
+use super::descriptor::Descriptor;
+use super::ids::{ContentHash, ExternalId, MapName, ModelId, ReferenceId};
+use crate::geography::{GeoCircle, GeoPoint, Heading};
 use time::OffsetDateTime;
 
 /// What the map builder says about a photo.
@@ -72,13 +71,66 @@ impl ReferenceFilter {
 
     /// Whether a reference with this location and capture time passes.
     pub fn accepts(&self, location: Option<GeoPoint>, captured_at: Option<OffsetDateTime>) -> bool {
-        self.near
-            .is_none_or(|circle| location.is_some_and(|point| circle.contains(point)))
-            && self
-                .captured_after
-                .is_none_or(|start| captured_at.is_some_and(|time| time >= start))
-            && self
-                .captured_before
-                .is_none_or(|end| captured_at.is_some_and(|time| time < end))
+        let is_near = match self.near {
+            Some(circle) => location.is_some_and(|point| circle.contains(point)),
+            None => true,
+        };
+        let is_late_enough = match self.captured_after {
+            Some(start) => captured_at.is_some_and(|time| time >= start),
+            None => true,
+        };
+        let is_early_enough = match self.captured_before {
+            Some(end) => captured_at.is_some_and(|time| time < end),
+            None => true,
+        };
+        is_near && is_late_enough && is_early_enough
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use time::macros::datetime;
+
+    const HERE: (f64, f64) = (51.0, 7.0);
+    const NOON: OffsetDateTime = datetime!(2024-05-01 12:00 UTC);
+
+    fn point((lat, lon): (f64, f64)) -> Option<GeoPoint> {
+        Some(GeoPoint::new(lat, lon).unwrap())
+    }
+
+    #[test]
+    fn an_empty_filter_accepts_everything() {
+        let filter = ReferenceFilter::default();
+        assert!(filter.is_empty());
+        assert!(filter.accepts(None, None));
+    }
+
+    #[test]
+    fn a_reference_without_a_location_or_time_fails_a_filter_that_asks_for_it() {
+        let near = ReferenceFilter {
+            near: Some(GeoCircle::new(point(HERE).unwrap(), 100.0).unwrap()),
+            ..Default::default()
+        };
+        assert!(near.accepts(point(HERE), None));
+        assert!(!near.accepts(point((51.01, 7.0)), None));
+        assert!(!near.accepts(None, None));
+        let recent = ReferenceFilter {
+            captured_after: Some(NOON),
+            ..Default::default()
+        };
+        assert!(!recent.accepts(None, None));
+    }
+
+    #[test]
+    fn the_start_of_a_time_range_belongs_to_it_and_the_end_does_not() {
+        let filter = ReferenceFilter {
+            captured_after: Some(NOON),
+            captured_before: Some(NOON + time::Duration::HOUR),
+            ..Default::default()
+        };
+        assert!(filter.accepts(None, Some(NOON)));
+        assert!(!filter.accepts(None, Some(NOON - time::Duration::SECOND)));
+        assert!(!filter.accepts(None, Some(NOON + time::Duration::HOUR)));
     }
 }

@@ -1,63 +1,62 @@
 //! A consistent copy of the database while it is in use.
 //!
 //! The copy is taken from one read snapshot through the engine's own backup interface, under a
-//! temporary name, synced and only then renamed: a file of the final name is always whole.
+//! temporary name, synced and only then given its final name: a file of the final name is always
+//! whole.
 
-use super::directory;
+use super::directory::io;
 use super::engine::failed;
-use crate::StoreError;
+use crate::error::StoreError;
+use placeformer_core::files::{directory_of, sync_directory, with_suffix};
 use rusqlite::Connection;
 use rusqlite::backup::{Backup, StepResult};
+use std::fs::{self, File};
 use std::path::Path;
+
+/// Database pages copied per call of the engine.
+const PAGES_PER_STEP: i32 = 256;
 
 /// Copies the database behind `connection` to `target`, which must not exist; returns its size in
 /// bytes.
 pub(super) fn write(connection: &Connection, target: &Path) -> Result<u64, StoreError> {
-    let io = |context: &'static str| {
-        let path = target.to_owned();
-        move |source| StoreError::Io {
-            context,
-            path,
-            source,
-        }
-    };
     if target.exists() {
         return Err(StoreError::BackupExists {
             path: target.to_owned(),
         });
     }
-    let mut partial = target.as_os_str().to_owned();
-    partial.push(".partial");
-    let partial = Path::new(&partial);
-    let copied = copy(connection, partial);
-    if let Err(error) = copied {
-        let _ = std::fs::remove_file(partial);
+    let partial = with_suffix(target, ".partial");
+    if let Err(error) = copy(connection, &partial) {
+        // The caller needs the first error, so a failure to remove the rest is not reported.
+        let _ = fs::remove_file(&partial);
         return Err(error);
     }
-    let file = std::fs::File::open(partial).map_err(io("cannot open the backup"))?;
-    file.sync_all().map_err(io("cannot sync the backup"))?;
-    let bytes = file.metadata().map_err(io("cannot read the backup"))?.len();
+    let file = File::open(&partial).map_err(io("cannot open the backup", target))?;
+    file.sync_all()
+        .map_err(io("cannot sync the backup", target))?;
+    let metadata = file.metadata();
+    let bytes = metadata
+        .map_err(io("cannot read the backup", target))?
+        .len();
     // Unlike a rename, a hard link refuses a name that has appeared meanwhile.
-    std::fs::hard_link(partial, target).map_err(io("cannot name the backup"))?;
-    std::fs::remove_file(partial).map_err(io("cannot finish the backup"))?;
-    let parent = target
-        .parent()
-        .filter(|parent| !parent.as_os_str().is_empty());
-    directory::sync(parent.unwrap_or(Path::new(".")))?;
+    fs::hard_link(&partial, target).map_err(io("cannot name the backup", target))?;
+    fs::remove_file(&partial).map_err(io("cannot finish the backup", target))?;
+    let directory = directory_of(target);
+    sync_directory(directory).map_err(io("cannot sync directory", directory))?;
     Ok(bytes)
 }
 
 fn copy(source: &Connection, partial: &Path) -> Result<(), StoreError> {
-    let copying = failed("copying it");
-    let mut target = Connection::open(partial).map_err(&copying)?;
-    // The snapshot keeps concurrent writers from restarting the copy.
-    let snapshot = source.unchecked_transaction().map_err(&copying)?;
+    let failed = failed("copying it");
+    let mut target = Connection::open(partial).map_err(&failed)?;
+    // The snapshot keeps concurrent writers from restarting the copy. It begins with the first
+    // statement that reads.
+    let snapshot = source.unchecked_transaction().map_err(&failed)?;
     snapshot
         .query_row("SELECT count(*) FROM map", [], |_| Ok(()))
-        .map_err(&copying)?;
-    let backup = Backup::new(&snapshot, &mut target).map_err(&copying)?;
+        .map_err(&failed)?;
+    let backup = Backup::new(&snapshot, &mut target).map_err(&failed)?;
     loop {
-        match backup.step(256).map_err(&copying)? {
+        match backup.step(PAGES_PER_STEP).map_err(&failed)? {
             StepResult::Done => break,
             StepResult::More => {}
             _ => {
@@ -68,9 +67,10 @@ fn copy(source: &Connection, partial: &Path) -> Result<(), StoreError> {
         }
     }
     drop(backup);
+    // The copy is one file without a log.
     target
         .pragma_update_and_check(None, "journal_mode", "delete", |_| Ok(()))
-        .map_err(&copying)?;
-    target.close().map_err(|(_, error)| copying(error))?;
-    snapshot.finish().map_err(&copying)
+        .map_err(&failed)?;
+    target.close().map_err(|(_, error)| failed(error))?;
+    snapshot.finish().map_err(&failed)
 }

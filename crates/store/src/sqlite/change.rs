@@ -1,13 +1,19 @@
 //! Changing and deleting what is stored, inside the writer's transaction.
 
 use super::engine::failed;
-use super::insert::{number_of_external, remove, write_row};
-use super::rows::{self, MapRow, REFERENCE_COLUMNS, REFERENCE_SOURCE, ReferenceRow, RowError};
-use crate::{ReferencePatch, StoreError, apply_patch};
+use super::keys::{MapNumber, ReferenceNumber};
+use super::map_row::MapRow;
+use super::reference_row::{
+    ReferenceRow, id_of, locate, number_of_external, read_by_number, reference_by_number,
+};
+use super::remove::remove;
+use super::row::RowError;
+use crate::error::StoreError;
+use crate::records::ReferencePatch;
 use placeformer_core::types::{
     Calibration, ContentHash, MapName, ModelId, Reference, ReferenceFields, ReferenceId,
 };
-use rusqlite::{Connection, params};
+use rusqlite::Connection;
 use time::OffsetDateTime;
 
 /// Changes a reference's fields; its descriptor stays.
@@ -16,107 +22,120 @@ pub(super) fn update(
     id: ReferenceId,
     patch: ReferencePatch,
 ) -> Result<Reference, StoreError> {
-    let updating = failed("changing a reference");
-    let (number, map) = rows::locate(connection, id)?;
-    let read = || -> Result<Option<(ReferenceRow, Reference)>, RowError> {
-        let sql = format!("SELECT {REFERENCE_COLUMNS} FROM {REFERENCE_SOURCE} WHERE r.number = ?1");
-        let mut statement = connection.prepare_cached(&sql)?;
-        let mut found = statement.query([number])?;
-        let Some(row) = found.next()? else {
-            return Ok(None);
-        };
-        Ok(Some((ReferenceRow::read(row)?, rows::read_reference(row)?)))
+    let updating = "changing a reference";
+    let located = locate(connection, id)?;
+    let found = read_by_number(connection, located.number, |columns, row| {
+        Ok((columns.read(row)?, columns.read_reference(row)?))
+    });
+    let found = found.map_err(|error| error.of_reference(id, updating))?;
+    let Some((mut row, mut reference)) = found else {
+        return Err(StoreError::ReferenceNotFound { id });
     };
-    let (mut row, mut reference) = match read() {
-        Ok(Some(found)) => found,
-        Ok(None) => return Err(StoreError::ReferenceNotFound { id }),
-        Err(RowError::Damaged(reason)) => return Err(StoreError::Corrupt { id, reason }),
-        Err(RowError::Engine(error)) => return Err(updating(error)),
-    };
-    apply_patch(&mut reference.fields, patch);
-    if let Some(external_id) = &reference.fields.external_id
-        && let Some(holder) = number_of_external(connection, map, external_id).map_err(&updating)?
-        && holder != number
-    {
-        let existing = rows::reference_by_number(connection, holder)
-            .ok()
-            .flatten()
-            .map_or(id, |holder| holder.id);
-        let (map, external_id) = (reference.map, external_id.clone());
-        return Err(StoreError::ExternalIdConflict {
-            map,
-            external_id,
-            existing,
-        });
-    }
+    patch.apply(&mut reference.fields);
+    refuse_conflict(connection, &row, &reference)?;
     row.set_fields(&reference.fields);
-    write_row(connection, &row).map_err(&updating)?;
-    let (map, model) = (reference.map, reference.model);
-    row.reference(map, model).map_err(|error| match error {
-        RowError::Damaged(reason) => StoreError::InvalidDescriptor { reason },
-        RowError::Engine(error) => updating(error),
-    })
+    row.write(connection).map_err(failed(updating))?;
+    // Read back from the row, so that the answer shows the values as they are stored.
+    row.into_reference(reference.map, reference.model)
+        .map_err(|error| error.of_reference(id, updating))
+}
+
+/// An error if the external id of `changed` belongs to another reference than the one in `row`.
+fn refuse_conflict(
+    connection: &Connection,
+    row: &ReferenceRow,
+    changed: &Reference,
+) -> Result<(), StoreError> {
+    let Some(external_id) = &changed.fields.external_id else {
+        return Ok(());
+    };
+    let owner = number_of_external(connection, row.map, external_id)
+        .map_err(failed("looking up an external id"))?;
+    match owner {
+        Some(number) if number != row.number => Err(StoreError::ExternalIdConflict {
+            map: changed.map.clone(),
+            external_id: external_id.clone(),
+            existing: id_of(connection, number),
+        }),
+        _ => Ok(()),
+    }
+}
+
+/// A reference that was deleted: its number, and what it was.
+pub(super) struct Deleted {
+    pub number: ReferenceNumber,
+    pub reference: Reference,
 }
 
 /// Deletes a reference, damaged or not, and returns what it was as far as it can be read.
-pub(super) fn delete(
-    connection: &Connection,
-    id: ReferenceId,
-) -> Result<(i64, Reference), StoreError> {
-    let deleting = failed("deleting a reference");
-    let (number, map_number) = rows::locate(connection, id)?;
+pub(super) fn delete(connection: &Connection, id: ReferenceId) -> Result<Deleted, StoreError> {
+    let failed = failed("deleting a reference");
+    let located = locate(connection, id)?;
     let name: String = connection
         .prepare_cached("SELECT name FROM map WHERE number = ?1")
-        .and_then(|mut statement| statement.query_row([map_number], |row| row.get(0)))
-        .map_err(&deleting)?;
+        .and_then(|mut statement| statement.query_row([located.map], |row| row.get("name")))
+        .map_err(&failed)?;
     let name: MapName = name
         .parse()
         .map_err(|_| StoreError::CorruptMap { map: name })?;
     let map = MapRow::require(connection, &name)?;
-    let reference = match rows::reference_by_number(connection, number) {
+    let reference = match reference_by_number(connection, located.number) {
         Ok(Some(reference)) => reference,
         Ok(None) => return Err(StoreError::ReferenceNotFound { id }),
         Err(RowError::Damaged(_)) => unreadable(id, name, map.model.clone()),
-        Err(RowError::Engine(error)) => return Err(deleting(error)),
+        Err(RowError::Engine(error)) => return Err(failed(error)),
     };
-    remove(connection, &map, number).map_err(&deleting)?;
-    Ok((number, reference))
+    remove(connection, &map, located.number).map_err(&failed)?;
+    Ok(Deleted {
+        number: located.number,
+        reference,
+    })
 }
 
 /// Stands for a reference whose own row is damaged.
 fn unreadable(id: ReferenceId, map: MapName, model: ModelId) -> Reference {
-    let (fields, content_hash) = (ReferenceFields::default(), ContentHash([0; 32]));
     Reference {
         id,
         map,
-        fields,
-        content_hash,
+        fields: ReferenceFields::default(),
+        content_hash: ContentHash([0; 32]),
         model,
         created_at: OffsetDateTime::UNIX_EPOCH,
     }
 }
 
-/// Makes a map and everything in it invisible; returns its number and how many references it had.
+/// A map that was deleted: its number, and how many references it had.
+pub(super) struct DeletedMap {
+    pub number: MapNumber,
+    pub references: u64,
+}
+
+/// Makes a map and everything in it invisible.
 pub(super) fn delete_map(
     connection: &Connection,
     name: &MapName,
-) -> Result<(i64, u64), StoreError> {
-    let sql = "UPDATE map SET name = NULL WHERE name = ?1 RETURNING number, reference_count";
-    let mut statement = connection
-        .prepare_cached(sql)
-        .map_err(failed("deleting a map"))?;
-    let mut rows = statement
-        .query([name.as_str()])
-        .map_err(failed("deleting a map"))?;
-    let row = rows.next().map_err(failed("deleting a map"))?;
-    let row = row.ok_or_else(|| StoreError::MapNotFound { map: name.clone() })?;
-    let deleted: (i64, i64) = row
-        .get(0)
-        .and_then(|number| Ok((number, row.get(1)?)))
-        .map_err(failed("deleting a map"))?;
-    // A statement with RETURNING is complete only when it has been stepped to its end.
-    while rows.next().map_err(failed("deleting a map"))?.is_some() {}
-    Ok((deleted.0, deleted.1.max(0) as u64))
+) -> Result<DeletedMap, StoreError> {
+    let delete = || -> rusqlite::Result<Option<DeletedMap>> {
+        let mut statement = connection.prepare_cached(
+            "UPDATE map SET name = NULL WHERE name = ?1 RETURNING number, reference_count",
+        )?;
+        let mut rows = statement.query([name.as_str()])?;
+        let Some(row) = rows.next()? else {
+            return Ok(None);
+        };
+        let references: i64 = row.get("reference_count")?;
+        let deleted = DeletedMap {
+            number: row.get("number")?,
+            references: references.max(0) as u64,
+        };
+        // A statement with RETURNING has done its work only when it has been stepped to its end.
+        while rows.next()?.is_some() {}
+        Ok(Some(deleted))
+    };
+    match delete().map_err(failed("deleting a map"))? {
+        Some(deleted) => Ok(deleted),
+        None => Err(StoreError::MapNotFound { map: name.clone() }),
+    }
 }
 
 /// Stores a map's calibration, or clears it.
@@ -126,15 +145,14 @@ pub(super) fn set_calibration(
     calibration: Option<&Calibration>,
 ) -> Result<(), StoreError> {
     let mut map = MapRow::require(connection, name)?;
-    // Checked where the map's model cannot change meanwhile.
-    if let Some(given) = calibration
-        .map(Calibration::model)
-        .filter(|given| **given != map.model)
+    // The model is compared here, inside the transaction, where it cannot change meanwhile.
+    if let Some(calibration) = calibration
+        && *calibration.model() != map.model
     {
         return Err(StoreError::CalibrationMismatch {
             map: name.clone(),
             bound: map.model,
-            given: given.clone(),
+            given: calibration.model().clone(),
         });
     }
     // A struct of strings and finite numbers always serialises.
@@ -142,19 +160,5 @@ pub(super) fn set_calibration(
     map.save(connection)
 }
 
-/// Records a damaged reference.
-pub(super) fn quarantine(
-    connection: &Connection,
-    number: i64,
-    map: i64,
-    id: ReferenceId,
-    reason: &str,
-) -> Result<(), StoreError> {
-    connection
-        .execute(
-            "INSERT OR IGNORE INTO quarantine (number, id, map, reason, detected_at) VALUES (?1, ?2, ?3, ?4, ?5)",
-            params![number, id.as_bytes().as_slice(), map, reason, rows::to_micros(OffsetDateTime::now_utc())],
-        )
-        .map(|_| ())
-        .map_err(failed("recording a damaged reference"))
-}
+#[cfg(test)]
+mod tests;

@@ -5,10 +5,11 @@
 //! past differs, is refused untouched.
 
 use super::engine::failed;
-use crate::{StoreError, crash_points};
-use rusqlite::{Connection, TransactionBehavior, params};
+use crate::crash_points;
+use crate::error::StoreError;
+use rusqlite::{Connection, TransactionBehavior, named_params};
 
-/// Every migration, oldest first; its version is its place, counting from 1.
+/// Name and SQL of every migration, oldest first. Its version is its place, counting from 1.
 const MIGRATIONS: &[(&str, &str)] = &[
     (
         "initial",
@@ -33,55 +34,71 @@ pub(super) fn apply(connection: &mut Connection) -> Result<(), StoreError> {
 }
 
 fn apply_all(connection: &mut Connection, migrations: &[(&str, &str)]) -> Result<(), StoreError> {
-    let migrating = failed("migrating it");
-    let applied = history(connection)?;
+    let applied = history(connection).map_err(failed("reading its schema history"))?;
     let supported = migrations.len() as i64;
-    if let Some(&(found, _)) = applied.last()
-        && found > supported
+    if let Some(newest) = applied.last()
+        && newest.version > supported
     {
-        return Err(StoreError::SchemaTooNew { found, supported });
+        return Err(StoreError::SchemaTooNew {
+            found: newest.version,
+            supported,
+        });
     }
-    for (place, (name, sql)) in migrations.iter().enumerate() {
-        let (version, checksum) = (place as i64 + 1, i64::from(crc32fast::hash(sql.as_bytes())));
-        match applied.iter().find(|(applied, _)| *applied == version) {
-            Some((_, same)) if *same == checksum => continue,
+    for (version, (name, sql)) in (1..).zip(migrations) {
+        let checksum = i64::from(crc32fast::hash(sql.as_bytes()));
+        match applied.iter().find(|applied| applied.version == version) {
+            Some(applied) if applied.checksum == checksum => {}
             Some(_) => return Err(StoreError::MigrationChanged { version }),
-            None => {}
+            None => {
+                tracing::info!(version, name, "migrating the store");
+                run(connection, version, name, sql, checksum).map_err(failed("migrating it"))?;
+            }
         }
-        tracing::info!(version, name, "migrating the store");
-        let transaction = connection
-            .transaction_with_behavior(TransactionBehavior::Immediate)
-            .map_err(&migrating)?;
-        transaction.execute_batch(HISTORY).map_err(&migrating)?;
-        transaction.execute_batch(sql).map_err(&migrating)?;
-        transaction
-            .execute(
-                "INSERT INTO schema_migration (version, name, checksum) VALUES (?1, ?2, ?3)",
-                params![version, name, checksum],
-            )
-            .map_err(&migrating)?;
-        crash_points::reach(crash_points::MID_MIGRATION);
-        transaction.commit().map_err(&migrating)?;
     }
     Ok(())
 }
 
-/// Versions and checksums applied so far, ascending; empty for a new database.
-fn history(connection: &Connection) -> Result<Vec<(i64, i64)>, StoreError> {
-    let reading = failed("reading its schema history");
-    if !connection
-        .table_exists(None, "schema_migration")
-        .map_err(&reading)?
-    {
+/// Runs one migration and records it.
+fn run(
+    connection: &mut Connection,
+    version: i64,
+    name: &str,
+    sql: &str,
+    checksum: i64,
+) -> rusqlite::Result<()> {
+    let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
+    transaction.execute_batch(HISTORY)?;
+    transaction.execute_batch(sql)?;
+    transaction.execute(
+        "INSERT INTO schema_migration (version, name, checksum)
+         VALUES (:version, :name, :checksum)",
+        named_params! { ":version": version, ":name": name, ":checksum": checksum },
+    )?;
+    crash_points::reach(crash_points::MID_MIGRATION);
+    transaction.commit()
+}
+
+/// A migration that the database has been through.
+struct Applied {
+    version: i64,
+    /// CRC-32 of its SQL.
+    checksum: i64,
+}
+
+/// The migrations applied so far, ascending; none for a new database.
+fn history(connection: &Connection) -> rusqlite::Result<Vec<Applied>> {
+    if !connection.table_exists(None, "schema_migration")? {
         return Ok(Vec::new());
     }
-    let mut statement = connection
-        .prepare("SELECT version, checksum FROM schema_migration ORDER BY version")
-        .map_err(&reading)?;
-    let rows = statement
-        .query_map([], |row| Ok((row.get(0)?, row.get(1)?)))
-        .map_err(&reading)?;
-    rows.collect::<Result<_, _>>().map_err(&reading)
+    let sql = "SELECT version, checksum FROM schema_migration ORDER BY version";
+    let mut statement = connection.prepare(sql)?;
+    let rows = statement.query_map([], |row| {
+        Ok(Applied {
+            version: row.get("version")?,
+            checksum: row.get("checksum")?,
+        })
+    })?;
+    rows.collect()
 }
 
 #[cfg(test)]

@@ -2,62 +2,93 @@
 //!
 //! | file | holds |
 //! |---|---|
-//! | `directory.rs` | the lock on the data directory; the reserve for a full disk |
-//! | `engine.rs` | connections, the pool of readers, what the engine's errors mean |
+//! | `directory.rs`, `reserve.rs` | the lock on the data directory; room for a full disk |
+//! | `engine.rs`, `readers.rs` | connections, what the engine's errors mean; the pool of readers |
 //! | `migrations.rs` | the schema's history |
-//! | `rows.rs` | rows <-> types, checksums |
-//! | `writer.rs` | the one writing thread and its group commit |
-//! | `insert.rs`, `change.rs`, `purge.rs`, `rehead.rs` | what is written |
-//! | `read.rs`, `verify.rs`, `backup.rs` | what is read |
-//! | `quarantine.rs` | references known to be damaged |
+//! | `keys.rs`, `checksum.rs`, `row.rs` | what all rows have in common |
+//! | `map_row.rs`, `reference_row.rs`, `parts.rs`, `sequence.rs` | the rows of each table |
+//! | `job.rs`, `writer.rs` | the one writing thread and its group commit |
+//! | `insert.rs`, `change.rs`, `remove.rs`, `purge.rs` | what is written |
+//! | `database.rs`, `quarantine.rs` | all connections; references known to be damaged |
+//! | `read.rs`, `page.rs`, `globals.rs` | what is read |
+//! | `replace_head.rs` | giving a map another head |
+//! | `verify.rs`, `backup.rs` | maintenance |
 
 mod backup;
 mod change;
+mod checksum;
+mod database;
 mod directory;
 mod engine;
+mod globals;
 mod insert;
+mod job;
+mod keys;
+mod map_row;
 mod migrations;
+mod page;
+mod parts;
 mod purge;
 mod quarantine;
 mod read;
-mod rehead;
-mod rows;
+mod readers;
+mod reference_row;
+mod remove;
+mod replace_head;
+mod reserve;
+mod row;
+mod sequence;
 mod verify;
 mod writer;
 
-use self::directory::{DataDirectory, Reserve};
-use self::engine::Readers;
-use self::insert::{Prepared, Replaced};
+use self::database::Database;
+use self::directory::DataDirectory;
+use self::insert::Prepared;
+use self::job::{Effect, Pending};
+use self::map_row::MapRow;
 use self::quarantine::Quarantine;
-use self::rows::MapRow;
-use self::writer::{Effect, Pending, Writer};
-use super::{
-    Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined,
-    ReferencePatch, StoreConfig, StoreError, VerifyReport,
+use self::readers::Readers;
+use self::reserve::Reserve;
+use self::writer::Writer;
+use crate::config::StoreConfig;
+use crate::crash_points;
+use crate::error::StoreError;
+use crate::records::{
+    Damage, Footprint, GlobalRow, Inserted, MapInfo, NewHead, Page, Quarantined, ReferencePatch,
+    VerifyReport,
 };
+use crate::traits::{HeadExchange, MaintainPlaces, ReadPlaces, WritePlaces};
+use placeformer_core::files::{sync_directory, with_suffix};
 use placeformer_core::types::{
     Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
 };
-use rusqlite::Connection;
 use std::path::{Path, PathBuf};
+
+/// Bytes that a change of metadata adds to the store, about.
+const PATCH_BYTES: usize = 1024;
+
+/// Bytes that a calibration adds to the store, about.
+const CALIBRATION_BYTES: usize = 2048;
 
 /// A store in one directory, shared by all threads of one process.
 pub struct SqliteStore {
     // Fields drop in this order: the writer finishes and closes the log while the directory is
     // still locked.
-    writer: Writer,
-    readers: Readers,
-    quarantine: Quarantine,
+    database: Database,
     path: PathBuf,
     config: StoreConfig,
     _directory: DataDirectory,
 }
 
 impl SqliteStore {
+    /// Name of the database inside a data directory.
+    pub const DATABASE: &str = directory::DATABASE;
+
     /// Opens the store in `directory`, creating and migrating it as needed.
     ///
-    /// Fails with [`StoreError::Locked`] while another process has it, and with
-    /// [`StoreError::SchemaTooNew`] if a newer release wrote it.
+    /// # Errors
+    /// [`StoreError::Locked`] while another process has it open, [`StoreError::SchemaTooNew`] if a
+    /// newer release wrote it, or whatever keeps the database from being opened.
     pub fn open(directory: &Path, config: &StoreConfig) -> Result<Self, StoreError> {
         let claimed = DataDirectory::claim(directory)?;
         let reserve = Reserve::take(directory, config)?;
@@ -66,27 +97,28 @@ impl SqliteStore {
         let mut connection = engine::open_writer(&path, config, reserve.log_bytes(config))?;
         migrations::apply(&mut connection)?;
         if is_new {
-            directory::sync(directory)?;
+            sync_directory(directory).map_err(directory::io("cannot sync directory", directory))?;
         }
         purge::abandon_unfinished_heads(&connection)?;
         let quarantine = Quarantine::load(&connection)?;
-        let writer = Writer::start(connection, reserve, config.queue)?;
-        let readers = Readers::new(path.clone(), config.clone());
-        Ok(Self {
-            writer,
-            readers,
+        let database = Database {
+            writer: Writer::start(connection, reserve, config.queue)?,
+            readers: Readers::new(path.clone(), config.clone()),
             quarantine,
+        };
+        Ok(Self {
+            database,
             path,
             config: config.clone(),
             _directory: claimed,
         })
     }
 
-    /// Name of the database inside a data directory.
-    pub const DATABASE: &str = directory::DATABASE;
-
-    /// As [`PlaceStore::backup`], of the store in a directory that another process may have open:
-    /// only its database is read. `target` must not exist.
+    /// As [`MaintainPlaces::backup`], of the store in a directory that another process may have
+    /// open: only its database is read.
+    ///
+    /// # Errors
+    /// There is no store, or `target` exists or cannot be written.
     pub fn backup_of(
         directory: &Path,
         config: &StoreConfig,
@@ -96,102 +128,45 @@ impl SqliteStore {
         backup::write(&engine::open_reader(&path, config)?, target)
     }
 
-    /// Takes a damaged reference out of service and records why.
-    fn put_in_quarantine(&self, number: i64, map: i64, id: ReferenceId, reason: &str) {
-        if !self.quarantine.add(number, map, id, reason) {
-            return;
-        }
-        tracing::error!(reference = %id, reason, "a stored reference is damaged; it is quarantined");
-        let owned = reason.to_owned();
-        let record =
-            move |connection: &Connection| change::quarantine(connection, number, map, id, &owned);
-        if let Err(error) = self.writer.run(Effect::Shrinks, record) {
-            // It stays out of service while this process lives and will be found again by the next.
-            tracing::warn!(%error, reference = %id, "cannot record the quarantine");
-        }
-    }
-
-    /// Reads with a connection from the pool; damage that no single record answers for is counted
-    /// here.
-    fn reading<T>(
-        &self,
-        work: impl FnOnce(&Connection) -> Result<T, StoreError>,
-    ) -> Result<T, StoreError> {
-        self.noticing(self.readers.with(work))
-    }
-
-    /// Writes, and waits until it is durable; as [`Self::reading`].
-    fn writing<T: Send + 'static>(
-        &self,
-        effect: Effect,
-        work: impl FnMut(&Connection) -> Result<T, StoreError> + Send + 'static,
-    ) -> Result<T, StoreError> {
-        self.noticing(self.writer.run(effect, work))
-    }
-
-    fn noticing<T>(&self, outcome: Result<T, StoreError>) -> Result<T, StoreError> {
-        outcome.inspect_err(|error| match error {
-            StoreError::Damaged { .. }
-            | StoreError::CorruptMap { .. }
-            | StoreError::CorruptHead { .. } => {
-                self.quarantine.met(error.to_string(), None);
-            }
-            _ => {}
-        })
-    }
-
-    fn submit_insert(
-        &self,
-        new: NewReference,
-    ) -> Result<Pending<(Inserted, Option<Replaced>)>, StoreError> {
+    fn submit_insert(&self, new: NewReference) -> Result<Pending<insert::Outcome>, StoreError> {
         let prepared = Prepared::new(new)?;
-        self.writer
-            .submit(Effect::Grows(prepared.bytes()), move |connection| {
-                insert::insert(connection, &prepared)
-            })
+        let effect = Effect::Grows(prepared.bytes());
+        let insert = move |connection: &_| insert::insert(connection, &prepared);
+        self.database.writer.submit(effect, insert)
     }
 
-    fn finish_insert(
-        &self,
-        pending: Pending<(Inserted, Option<Replaced>)>,
-    ) -> Result<Inserted, StoreError> {
-        let (inserted, healed) = self.noticing(pending.wait())?;
-        healed
-            .into_iter()
-            .for_each(|(number, id)| self.quarantine.replaced(number, id));
-        Ok(inserted)
+    fn finish_insert(&self, pending: Pending<insert::Outcome>) -> Result<Inserted, StoreError> {
+        let outcome = self.database.wait(pending)?;
+        if let Some(replaced) = outcome.replaced {
+            let quarantine = &self.database.quarantine;
+            quarantine.replaced(replaced.number, replaced.id);
+        }
+        Ok(outcome.inserted)
     }
 
     fn info(&self, map: MapRow) -> MapInfo {
-        let references =
-            (map.reference_count.max(0) as u64).saturating_sub(self.quarantine.count(map.number));
+        let recorded = map.reference_count.max(0) as u64;
+        let quarantined = self.database.quarantine.count(map.number);
         let calibration = map.calibration();
         MapInfo {
             name: map.name,
             model: map.model,
-            references,
+            references: recorded.saturating_sub(quarantined),
             created_at: map.created_at,
             calibration,
         }
     }
 }
 
-impl PlaceStore for SqliteStore {
-    fn insert(&self, new: NewReference) -> Result<Inserted, StoreError> {
-        let pending = self.submit_insert(new)?;
-        self.finish_insert(pending)
-    }
-
-    fn insert_many(&self, new: Vec<NewReference>) -> Vec<Result<Inserted, StoreError>> {
-        let pending: Vec<_> = new.into_iter().map(|new| self.submit_insert(new)).collect();
-        pending
-            .into_iter()
-            .map(|pending| self.finish_insert(pending?))
-            .collect()
-    }
-
+impl ReadPlaces for SqliteStore {
     fn get(&self, id: ReferenceId) -> Result<Reference, StoreError> {
-        self.reading(|connection| self.read_reference(connection, id))
+        let database = &self.database;
+        database.read(|connection| database.reference(connection, id))
+    }
+
+    fn get_many(&self, ids: &[ReferenceId]) -> Result<Vec<Reference>, StoreError> {
+        let database = &self.database;
+        database.read(|connection| database.references(connection, ids))
     }
 
     fn find_external(
@@ -199,22 +174,8 @@ impl PlaceStore for SqliteStore {
         map: &MapName,
         external_id: &ExternalId,
     ) -> Result<Option<Reference>, StoreError> {
-        self.reading(|connection| self.read_external(connection, map, external_id))
-    }
-
-    fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, StoreError> {
-        self.get(id)?;
-        self.writing(Effect::Grows(1024), move |connection| {
-            change::update(connection, id, patch.clone())
-        })
-    }
-
-    fn delete(&self, id: ReferenceId) -> Result<Reference, StoreError> {
-        let (number, reference) = self.writing(Effect::Shrinks, move |connection| {
-            change::delete(connection, id)
-        })?;
-        self.quarantine.forget(number);
-        Ok(reference)
+        let database = &self.database;
+        database.read(|connection| database.reference_by_external_id(connection, map, external_id))
     }
 
     fn list(
@@ -223,51 +184,38 @@ impl PlaceStore for SqliteStore {
         after: Option<ReferenceId>,
         limit: usize,
     ) -> Result<Page, StoreError> {
-        self.reading(|connection| self.read_page(connection, map, after, limit))
-    }
-
-    fn maps(&self) -> Result<Vec<MapInfo>, StoreError> {
-        let (maps, damaged) = self.reading(MapRow::all)?;
-        for map in damaged {
-            let error = StoreError::CorruptMap { map };
-            tracing::error!(%error, "a map is not served");
-            self.quarantine.met(error.to_string(), None);
-        }
-        Ok(maps.into_iter().map(|map| self.info(map)).collect())
-    }
-
-    fn map(&self, name: &MapName) -> Result<MapInfo, StoreError> {
-        self.reading(|connection| MapRow::require(connection, name))
-            .map(|map| self.info(map))
-    }
-
-    fn delete_map(&self, name: &MapName) -> Result<u64, StoreError> {
-        let name = name.clone();
-        let (number, references) = self.writing(Effect::Shrinks, move |connection| {
-            change::delete_map(connection, &name)
-        })?;
-        super::crash_points::reach(super::crash_points::MAP_DELETED);
-        let damaged = self.quarantine.count(number);
-        self.quarantine.forget_map(number);
-        Ok(references.saturating_sub(damaged))
-    }
-
-    fn get_many(&self, ids: &[ReferenceId]) -> Result<Vec<Reference>, StoreError> {
-        self.reading(|connection| {
-            let mut references = Vec::with_capacity(ids.len());
-            for &id in ids {
-                match self.read_reference(connection, id) {
-                    Ok(reference) => references.push(reference),
-                    Err(StoreError::ReferenceNotFound { .. } | StoreError::Corrupt { .. }) => {}
-                    Err(error) => return Err(error),
-                }
-            }
-            Ok(references)
-        })
+        let database = &self.database;
+        database.read(|connection| database.page(connection, map, after, limit))
     }
 
     fn patches(&self, id: ReferenceId) -> Result<PackedPatches, StoreError> {
-        self.reading(|connection| self.read_patches(connection, id))
+        let database = &self.database;
+        database.read(|connection| database.patches(connection, id))
+    }
+
+    fn maps(&self) -> Result<Vec<MapInfo>, StoreError> {
+        let maps = self.database.read(MapRow::all)?;
+        for map in maps.damaged {
+            let error = StoreError::CorruptMap { map };
+            tracing::error!(%error, "a map is not served");
+            let quarantine = &self.database.quarantine;
+            quarantine.count_other(error.to_string(), None);
+        }
+        Ok(maps.sound.into_iter().map(|map| self.info(map)).collect())
+    }
+
+    fn map(&self, name: &MapName) -> Result<MapInfo, StoreError> {
+        let map = self
+            .database
+            .read(|connection| MapRow::require(connection, name))?;
+        Ok(self.info(map))
+    }
+
+    fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError> {
+        self.database.read(|connection| {
+            let map = MapRow::require(connection, map)?;
+            replace_head::read_head(connection, &map)
+        })
     }
 
     fn scan_globals(
@@ -275,13 +223,58 @@ impl PlaceStore for SqliteStore {
         map: &MapName,
         visit: &mut dyn FnMut(GlobalRow),
     ) -> Result<(), StoreError> {
-        self.reading(|connection| {
-            // One snapshot: a head exchanged meanwhile must not pull the version away.
-            let scanning = engine::failed("reading global vectors");
-            let snapshot = connection.unchecked_transaction().map_err(&scanning)?;
-            let map = MapRow::require(&snapshot, map)?;
-            self.read_globals(&snapshot, &map, visit)
-        })
+        let database = &self.database;
+        database.read(|connection| database.scan_globals(connection, map, visit))
+    }
+}
+
+impl WritePlaces for SqliteStore {
+    fn insert(&self, new: NewReference) -> Result<Inserted, StoreError> {
+        let pending = self.submit_insert(new)?;
+        self.finish_insert(pending)
+    }
+
+    fn insert_many(&self, new: Vec<NewReference>) -> Vec<Result<Inserted, StoreError>> {
+        // All are handed in before the first is waited for, so that they share syncs of the disk.
+        let pending: Vec<_> = new.into_iter().map(|new| self.submit_insert(new)).collect();
+        pending
+            .into_iter()
+            .map(|pending| self.finish_insert(pending?))
+            .collect()
+    }
+
+    fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, StoreError> {
+        // Reading it first refuses a quarantined reference and quarantines a damaged one.
+        self.get(id)?;
+        let effect = Effect::Grows(PATCH_BYTES);
+        let updated = self.database.write(effect, move |connection| {
+            change::update(connection, id, patch.clone())
+        });
+        // It may have been damaged only after it was read.
+        if let Err(StoreError::CorruptRecord { id, reason }) = &updated {
+            self.database.quarantine_damaged_by_id(*id, reason);
+        }
+        updated
+    }
+
+    fn delete(&self, id: ReferenceId) -> Result<Reference, StoreError> {
+        let deleted = self.database.write(Effect::Shrinks, move |connection| {
+            change::delete(connection, id)
+        })?;
+        self.database.quarantine.forget(deleted.number);
+        Ok(deleted.reference)
+    }
+
+    fn delete_map(&self, name: &MapName) -> Result<u64, StoreError> {
+        let name = name.clone();
+        let deleted = self.database.write(Effect::Shrinks, move |connection| {
+            change::delete_map(connection, &name)
+        })?;
+        crash_points::reach(crash_points::MAP_DELETED);
+        let quarantine = &self.database.quarantine;
+        let quarantined = quarantine.count(deleted.number);
+        quarantine.forget_map(deleted.number);
+        Ok(deleted.references.saturating_sub(quarantined))
     }
 
     fn replace_globals(
@@ -290,11 +283,7 @@ impl PlaceStore for SqliteStore {
         head: NewHead,
         exchange: &mut dyn HeadExchange,
     ) -> Result<(), StoreError> {
-        self.exchange_head(map, head, exchange)
-    }
-
-    fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError> {
-        self.reading(|connection| rehead::read_head(connection, &MapRow::require(connection, map)?))
+        self.database.replace_head(map, head, exchange)
     }
 
     fn set_calibration(
@@ -303,38 +292,43 @@ impl PlaceStore for SqliteStore {
         calibration: Option<Calibration>,
     ) -> Result<(), StoreError> {
         let map = map.clone();
-        self.writing(Effect::Grows(2048), move |connection| {
+        let effect = Effect::Grows(CALIBRATION_BYTES);
+        self.database.write(effect, move |connection| {
             change::set_calibration(connection, &map, calibration.as_ref())
         })
     }
+}
 
+impl MaintainPlaces for SqliteStore {
     fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError> {
-        Ok(self.quarantine.list())
+        Ok(self.database.quarantine.list())
     }
 
     fn drain_damage(&self) -> Damage {
-        self.quarantine.drain()
+        self.database.quarantine.drain()
     }
 
     fn verify(&self) -> Result<VerifyReport, StoreError> {
-        self.readers.with(|connection| self.verify_all(connection))
+        // Damage of a map is in the report, so it is not counted a second time.
+        let database = &self.database;
+        database
+            .readers
+            .with(|connection| database.verify(connection))
     }
 
     fn backup(&self, target: &Path) -> Result<u64, StoreError> {
         backup::write(&engine::open_reader(&self.path, &self.config)?, target)
     }
 
-    fn footprint(&self) -> Result<(u64, u64), StoreError> {
-        let size = |suffix: &str| {
-            let mut name = self.path.as_os_str().to_owned();
-            name.push(suffix);
-            std::fs::metadata(name).map_or(0, |meta| meta.len())
-        };
-        let on_disk = size("") + size("-wal") + size("-shm");
-        let connections = self.readers.open() as u64 + 1;
-        Ok((
-            on_disk,
-            connections * u64::from(self.config.cache_kib) * 1024,
-        ))
+    fn footprint(&self) -> Result<Footprint, StoreError> {
+        let size = |path: &Path| std::fs::metadata(path).map_or(0, |meta| meta.len());
+        let log = size(&with_suffix(&self.path, "-wal"));
+        let log_index = size(&with_suffix(&self.path, "-shm"));
+        let writer = 1;
+        let connections = self.database.readers.open() as u64 + writer;
+        Ok(Footprint {
+            disk_bytes: size(&self.path) + log + log_index,
+            cache_bytes: connections * u64::from(self.config.cache_kib) * 1024,
+        })
     }
 }

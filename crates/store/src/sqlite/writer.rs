@@ -1,18 +1,20 @@
 //! The one thread that writes, and how many writers share one sync of the disk.
 //!
-//! Callers hand in jobs and wait. The thread takes the first job and whatever else waits by then,
-//! runs all in one transaction, each under a savepoint of its own, commits once, and only then
-//! tells every caller. While the disk syncs, the next group gathers by itself; an idle store
-//! commits a lone job at once. A job that fails undoes itself only. If the group as a whole fails,
-//! each job is tried again alone, so that nobody pays for another's fault.
+//! Callers hand in jobs and wait. The thread takes the first job and all that wait by then. It runs
+//! them in one transaction, each under a savepoint of its own, commits once, and only then answers
+//! every caller. While the disk syncs, the next group gathers by itself; an idle store commits a
+//! lone job at once. A job that fails undoes itself only. If the group as a whole fails, each job is
+//! tried again alone, so that no caller suffers from the fault of another.
 //!
 //! On a full disk the log is folded into the database and the job tried once more; deletes may then
 //! use up the [`Reserve`], and until it can be restored jobs that grow the store are refused.
 
-use super::directory::Reserve;
 use super::engine::failed;
+use super::job::{Effect, Job, Pending, job};
 use super::purge;
-use crate::{StoreError, crash_points};
+use super::reserve::Reserve;
+use crate::crash_points;
+use crate::error::StoreError;
 use rusqlite::Connection;
 use std::sync::mpsc::{Receiver, RecvError, SyncSender, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
@@ -23,69 +25,7 @@ const GROUP_JOBS: usize = 256;
 /// Most new bytes in one transaction.
 const GROUP_BYTES: usize = 8 << 20;
 
-/// Whether a job needs more room on the disk when done.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Effect {
-    /// Takes new bytes in; the number bounds the size of a group.
-    Grows(usize),
-    /// Deletes or marks; may use the reserve.
-    Shrinks,
-}
-
-/// A unit of writing that can be run again from the start after a rollback.
-trait Job: Send {
-    fn effect(&self) -> Effect;
-    /// Runs inside a transaction; keeps its outcome.
-    fn run(&mut self, connection: &Connection);
-    /// The kept outcome's error, if any.
-    fn error(&self) -> Option<&StoreError>;
-    /// Tells the caller: the kept outcome, or `failure` if the transaction failed.
-    fn finish(self: Box<Self>, failure: Option<StoreError>);
-}
-
-struct Task<T, F> {
-    effect: Effect,
-    work: F,
-    outcome: Option<Result<T, StoreError>>,
-    reply: SyncSender<Result<T, StoreError>>,
-}
-
-impl<T: Send, F: FnMut(&Connection) -> Result<T, StoreError> + Send> Job for Task<T, F> {
-    fn effect(&self) -> Effect {
-        self.effect
-    }
-
-    fn run(&mut self, connection: &Connection) {
-        self.outcome = Some((self.work)(connection));
-    }
-
-    fn error(&self) -> Option<&StoreError> {
-        self.outcome
-            .as_ref()
-            .and_then(|outcome| outcome.as_ref().err())
-    }
-
-    fn finish(self: Box<Self>, failure: Option<StoreError>) {
-        let outcome = failure
-            .map(Err)
-            .or(self.outcome)
-            .unwrap_or(Err(StoreError::Closing));
-        // A caller that stopped waiting has nothing to hear.
-        let _ = self.reply.send(outcome);
-    }
-}
-
-/// An answer that is on its way.
-pub(super) struct Pending<T>(Receiver<Result<T, StoreError>>);
-
-impl<T> Pending<T> {
-    /// Blocks until the job is durable or has failed.
-    pub(super) fn wait(self) -> Result<T, StoreError> {
-        self.0.recv().unwrap_or(Err(StoreError::Closing))
-    }
-}
-
-/// The handle to the writing thread; dropping it finishes the jobs at hand, then closes the
+/// The handle to the writing thread. Dropping it finishes the jobs handed in, then closes the
 /// database.
 pub(super) struct Writer {
     jobs: Option<SyncSender<Box<dyn Job>>>,
@@ -127,16 +67,10 @@ impl Writer {
         effect: Effect,
         work: impl FnMut(&Connection) -> Result<T, StoreError> + Send + 'static,
     ) -> Result<Pending<T>, StoreError> {
-        let (reply, answer) = sync_channel(1);
-        let task = Task {
-            effect,
-            work,
-            outcome: None,
-            reply,
-        };
+        let (job, pending) = job(effect, work);
         let jobs = self.jobs.as_ref().ok_or(StoreError::Closing)?;
-        jobs.send(Box::new(task)).map_err(|_| StoreError::Closing)?;
-        Ok(Pending(answer))
+        jobs.send(job).map_err(|_| StoreError::Closing)?;
+        Ok(pending)
     }
 
     /// Hands in a job and waits until it is durable.
@@ -160,6 +94,7 @@ impl Drop for Writer {
     }
 }
 
+/// The writing thread's own state.
 struct Worker {
     connection: Connection,
     reserve: Reserve,
@@ -168,13 +103,21 @@ struct Worker {
     purging: bool,
 }
 
+/// Jobs that share a transaction.
+struct Group {
+    jobs: Vec<Box<dyn Job>>,
+    /// Whether any of them deletes.
+    shrinks: bool,
+}
+
 impl Worker {
     fn run(mut self) {
         while let Ok(first) = self.next() {
-            let (group, shrinks) = self.gather(first);
-            self.commit(group);
-            // Any deletion may have left something behind; looking is two index lookups.
-            self.purging = self.purging || shrinks;
+            let group = self.gather(first);
+            self.commit(group.jobs);
+            // Any deletion may have left something to remove. Looking whether it has costs two
+            // lookups in an index.
+            self.purging = self.purging || group.shrinks;
             self.purge_some();
         }
         self.checkpoint();
@@ -192,45 +135,66 @@ impl Worker {
         self.waiting.recv()
     }
 
-    fn gather(&self, first: Box<dyn Job>) -> (Vec<Box<dyn Job>>, bool) {
-        let mut group = vec![first];
-        let (mut bytes, mut shrinks) = (0, false);
-        loop {
-            match group.last().map(|job| job.effect()) {
-                Some(Effect::Grows(more)) => bytes += more,
-                _ => shrinks = true,
+    /// `first` and the jobs that wait by now, as far as they fit in one transaction.
+    fn gather(&self, first: Box<dyn Job>) -> Group {
+        let mut group = Group {
+            jobs: Vec::new(),
+            shrinks: false,
+        };
+        let mut bytes = 0;
+        let mut next = Some(first);
+        while let Some(job) = next {
+            match job.effect() {
+                Effect::Grows(more) => bytes += more,
+                Effect::Shrinks => group.shrinks = true,
             }
-            if group.len() == GROUP_JOBS || bytes >= GROUP_BYTES {
-                return (group, shrinks);
+            group.jobs.push(job);
+            if group.jobs.len() == GROUP_JOBS || bytes >= GROUP_BYTES {
+                break;
             }
-            match self.waiting.try_recv() {
-                Ok(job) => group.push(job),
-                Err(_) => return (group, shrinks),
-            }
+            next = self.waiting.try_recv().ok();
         }
+        group
     }
 
-    /// Makes a group durable and tells its callers.
-    fn commit(&mut self, group: Vec<Box<dyn Job>>) {
-        let (mut admitted, mut refused) = (group, Vec::new());
-        if !self.reserve.held() && !self.restore_reserve() {
-            (admitted, refused) = admitted
-                .into_iter()
-                .partition(|job| job.effect() == Effect::Shrinks);
-        }
-        refused
-            .into_iter()
-            .for_each(|job| job.finish(Some(StoreError::DiskFull)));
+    /// Makes a group durable and answers its callers.
+    fn commit(&mut self, jobs: Vec<Box<dyn Job>>) {
+        let mut admitted = self.admit(jobs);
         if admitted.is_empty() {
             return;
         }
         match self.attempt(&mut admitted) {
-            Ok(()) => admitted.into_iter().for_each(|job| job.finish(None)),
-            Err(_) if admitted.len() > 1 => {
-                admitted.into_iter().for_each(|job| self.commit_alone(job))
+            Ok(()) => {
+                for job in admitted {
+                    job.finish(None);
+                }
             }
-            Err(error) => admitted.into_iter().for_each(|job| self.retry(job, &error)),
+            Err(error) if admitted.len() == 1 => {
+                for job in admitted {
+                    self.retry(job, &error);
+                }
+            }
+            Err(_) => {
+                for job in admitted {
+                    self.commit_alone(job);
+                }
+            }
         }
+    }
+
+    /// The jobs that may run. Without the reserve those that grow the store are refused.
+    fn admit(&mut self, jobs: Vec<Box<dyn Job>>) -> Vec<Box<dyn Job>> {
+        if self.reserve.is_in_place() || self.restore_reserve() {
+            return jobs;
+        }
+        let mut admitted = Vec::new();
+        for job in jobs {
+            match job.effect() {
+                Effect::Shrinks => admitted.push(job),
+                Effect::Grows(_) => job.finish(Some(StoreError::DiskFull)),
+            }
+        }
+        admitted
     }
 
     fn commit_alone(&mut self, mut job: Box<dyn Job>) {
@@ -240,64 +204,58 @@ impl Worker {
         }
     }
 
-    /// The last attempt for a lone job whose transaction failed.
+    /// The last attempt for a lone job whose transaction failed with `first`.
     fn retry(&mut self, mut job: Box<dyn Job>, first: &StoreError) {
         if matches!(first, StoreError::DiskFull) {
             self.make_room(job.effect());
         }
-        match self.attempt(std::slice::from_mut(&mut job)) {
-            Ok(()) => job.finish(None),
-            Err(error) => job.finish(Some(error)),
-        }
+        let outcome = self.attempt(std::slice::from_mut(&mut job));
+        job.finish(outcome.err());
         self.restore_reserve();
     }
 
     /// Runs jobs in one transaction. An error means that nothing of any of them remains.
     fn attempt(&self, jobs: &mut [Box<dyn Job>]) -> Result<(), StoreError> {
         crash_points::reach(crash_points::BEFORE_BEGIN);
-        let writing = failed("writing");
-        self.connection
-            .execute_batch("BEGIN IMMEDIATE")
-            .map_err(&writing)?;
+        self.execute("BEGIN IMMEDIATE")?;
         let outcome = self.run_all(jobs).and_then(|()| {
             crash_points::reach(crash_points::BEFORE_COMMIT);
-            self.connection.execute_batch("COMMIT").map_err(&writing)
+            self.execute("COMMIT")
         });
         if outcome.is_ok() {
             crash_points::reach(crash_points::AFTER_COMMIT);
         } else if !self.connection.is_autocommit()
-            && let Err(error) = self.connection.execute_batch("ROLLBACK")
+            && let Err(error) = self.execute("ROLLBACK")
         {
             tracing::error!(%error, "cannot roll back");
         }
         outcome
     }
 
+    /// Runs every job under a savepoint, and undoes those that fail. An error means that all of them
+    /// have to start over.
     fn run_all(&self, jobs: &mut [Box<dyn Job>]) -> Result<(), StoreError> {
-        let writing = failed("writing");
         for job in jobs {
-            self.connection
-                .execute_batch("SAVEPOINT job")
-                .map_err(&writing)?;
+            self.execute("SAVEPOINT job")?;
             job.run(&self.connection);
             match job.error() {
-                None => self
-                    .connection
-                    .execute_batch("RELEASE job")
-                    .map_err(&writing)?,
-                // The engine may have rolled everything back itself; the others must then start
-                // over.
+                None => self.execute("RELEASE job")?,
                 Some(StoreError::DiskFull) => return Err(StoreError::DiskFull),
+                // The engine has rolled the whole transaction back by itself, and the jobs before
+                // this one with it.
                 Some(_) if self.connection.is_autocommit() => {
                     return Err(StoreError::Busy { context: "writing" });
                 }
-                Some(_) => self
-                    .connection
-                    .execute_batch("ROLLBACK TO job; RELEASE job")
-                    .map_err(&writing)?,
+                Some(_) => self.execute("ROLLBACK TO job; RELEASE job")?,
             }
         }
         Ok(())
+    }
+
+    fn execute(&self, sql: &str) -> Result<(), StoreError> {
+        self.connection
+            .execute_batch(sql)
+            .map_err(failed("writing"))
     }
 
     /// Frees what can be freed for a job that found the disk full.
@@ -313,7 +271,7 @@ impl Worker {
     }
 
     fn restore_reserve(&mut self) -> bool {
-        if !self.reserve.held() {
+        if !self.reserve.is_in_place() {
             self.checkpoint();
         }
         self.reserve.restore()
@@ -336,10 +294,8 @@ impl Worker {
 
     /// Folds the log into the database as far as readers allow, and cuts it.
     fn checkpoint(&self) {
-        if let Err(error) = self
-            .connection
-            .query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |_| Ok(()))
-        {
+        let sql = "PRAGMA wal_checkpoint(TRUNCATE)";
+        if let Err(error) = self.connection.query_row(sql, [], |_| Ok(())) {
             tracing::warn!(%error, "cannot fold the log into the database now");
         }
     }
