@@ -14,7 +14,7 @@ use placeformer_kernels::simd;
 use placeformer_lab::bench::baselines::{self, joined};
 use placeformer_lab::bench::scenes::{CANDIDATES, CAPS, DIM, RerankScene};
 use placeformer_lab::bench::store_scene;
-use placeformer_store::PlaceStore;
+use placeformer_store::ReadPlaces;
 use placeformer_vision::extract::pack;
 use placeformer_vision::rerank::{RerankConfig, Reranked, Reranker};
 use rayon::prelude::*;

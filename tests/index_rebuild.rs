@@ -14,7 +14,7 @@ use placeformer_core::types::{
     ReferenceFields, ReferenceFilter, ReferenceId,
 };
 use placeformer_store::{
-    Inserted, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, apply_patch,
+    Inserted, ReadPlaces, ReferencePatch, SqliteStore, StoreConfig, WritePlaces,
 };
 use placeformer_vision::search::{IndexBuilder, IndexEntry, MapIndex};
 use places::{map, named_reference, reference, unit_vector};
@@ -184,7 +184,7 @@ impl History {
                     .block_on(self.service().update(id, patch.clone()))
                     .unwrap();
                 let expected = self.model.0.get_mut(&id).unwrap();
-                apply_patch(&mut expected.fields, patch);
+                patch.apply(&mut expected.fields);
                 assert_eq!(changed, *expected);
             }
             Operation::Delete(which) => {

@@ -3,7 +3,7 @@
 #[path = "common/town.rs"]
 mod town;
 
-use placeformer_store::{PlaceStore, SqliteStore, StoreConfig};
+use placeformer_store::{ReadPlaces, SqliteStore, StoreConfig};
 use placeformer_vision::extract::{Aggregate, Head, Preset, VitWeights};
 use std::path::Path;
 use std::process::Command;

@@ -8,7 +8,7 @@ use anyhow::{Context, bail, ensure};
 use clap::Subcommand;
 use indicatif::{ProgressBar, ProgressStyle};
 use placeformer_core::types::MapName;
-use placeformer_store::{HeadExchange, NewHead};
+use placeformer_store::{HeadExchange, NewHead, StoreError};
 use placeformer_vision::extract::Head;
 use rayon::prelude::*;
 use serde_json::Value;
@@ -254,11 +254,12 @@ struct Projecting<'a> {
 }
 
 impl HeadExchange for Projecting<'_> {
-    fn project(&mut self, pooled: &[Vec<f32>]) -> Vec<Vec<f32>> {
+    fn project(&mut self, pooled: &[Vec<f32>]) -> Result<Vec<Vec<f32>>, StoreError> {
         self.bar.inc(pooled.len() as u64);
-        pooled
+        let globals = pooled
             .par_iter()
             .map(|pooled| self.head.project_stored(pooled))
-            .collect()
+            .collect();
+        Ok(globals)
     }
 }

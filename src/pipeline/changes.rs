@@ -70,7 +70,7 @@ impl Service {
 
     fn delete_now(&self, id: ReferenceId) -> Result<Reference, PipelineError> {
         let found = self.store.get(id);
-        if let Err(StoreError::Corrupt { .. }) = found {
+        if let Err(StoreError::CorruptRecord { .. }) = found {
             // It cannot say which map it is of; following the damage takes it out of the index.
             self.follow_damage();
             return Ok(self.store.delete(id)?);

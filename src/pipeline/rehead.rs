@@ -167,11 +167,12 @@ struct Exchange<'a> {
 }
 
 impl HeadExchange for Exchange<'_> {
-    fn project(&mut self, pooled: &[Vec<f32>]) -> Vec<Vec<f32>> {
-        pooled
+    fn project(&mut self, pooled: &[Vec<f32>]) -> Result<Vec<Vec<f32>>, StoreError> {
+        let globals = pooled
             .par_iter()
             .map(|pooled| self.head.project_stored(pooled))
-            .collect()
+            .collect();
+        Ok(globals)
     }
 
     fn converted(&mut self, row: GlobalRow) {

@@ -151,7 +151,9 @@ impl Service {
             return;
         };
         match footprint {
-            Ok((_, engine)) => self.metrics.set_memory(MemoryComponent::Sqlite, engine),
+            Ok(footprint) => self
+                .metrics
+                .set_memory(MemoryComponent::Sqlite, footprint.cache_bytes),
             Err(error) => tracing::warn!(%error, "the store's footprint could not be read"),
         }
         match quarantined {

@@ -8,11 +8,10 @@ use placeformer_core::types::{
     Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
 };
 use placeformer_store::{
-    Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined,
-    ReferencePatch, SqliteStore, StoreError, VerifyReport,
+    CombinedStore, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, ReadPlaces,
+    ReferencePatch, SqliteStore, StoreError, WritePlaces,
 };
 use serde_json::json;
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
@@ -203,42 +202,28 @@ async fn json_beside_the_image_is_short() {
 
 // ---------------------------------------------------------------- the store
 
-/// A store whose listings and deletions wait at a gate; a listing holds a connection meanwhile.
-struct Gated {
-    inner: SqliteStore,
+/// The gate at which listings and deletions wait.
+#[derive(Clone)]
+struct AtGate {
     gate: Arc<Gate>,
     /// Calls that came to the gate.
     arrived: Arc<AtomicUsize>,
 }
 
-impl Gated {
+impl AtGate {
     fn wait(&self) {
         self.arrived.fetch_add(1, Ordering::SeqCst);
         self.gate.pass();
     }
 }
 
-impl PlaceStore for Gated {
-    fn insert(&self, new: NewReference) -> Result<Inserted, StoreError> {
-        self.inner.insert(new)
-    }
-    fn get(&self, id: ReferenceId) -> Result<Reference, StoreError> {
-        self.inner.get(id)
-    }
-    fn find_external(
-        &self,
-        map: &MapName,
-        external_id: &ExternalId,
-    ) -> Result<Option<Reference>, StoreError> {
-        self.inner.find_external(map, external_id)
-    }
-    fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, StoreError> {
-        self.inner.update(id, patch)
-    }
-    fn delete(&self, id: ReferenceId) -> Result<Reference, StoreError> {
-        self.wait();
-        self.inner.delete(id)
-    }
+/// The reading part of a store whose listings wait at the gate, each with a connection in use.
+struct GatedReading {
+    inner: Arc<SqliteStore>,
+    gate: AtGate,
+}
+
+impl ReadPlaces for GatedReading {
     fn list(
         &self,
         map: Option<&MapName>,
@@ -246,24 +231,42 @@ impl PlaceStore for Gated {
         limit: usize,
     ) -> Result<Page, StoreError> {
         self.inner
-            .scan_globals(&"m".parse().unwrap(), &mut |_| self.wait())?;
+            .scan_globals(&"m".parse().unwrap(), &mut |_| self.gate.wait())?;
         self.inner.list(map, after, limit)
     }
-    fn maps(&self) -> Result<Vec<MapInfo>, StoreError> {
-        self.inner.maps()
+
+    fn get(&self, id: ReferenceId) -> Result<Reference, StoreError> {
+        self.inner.get(id)
     }
-    fn map(&self, name: &MapName) -> Result<MapInfo, StoreError> {
-        self.inner.map(name)
-    }
-    fn delete_map(&self, name: &MapName) -> Result<u64, StoreError> {
-        self.inner.delete_map(name)
-    }
+
     fn get_many(&self, ids: &[ReferenceId]) -> Result<Vec<Reference>, StoreError> {
         self.inner.get_many(ids)
     }
+
+    fn find_external(
+        &self,
+        map: &MapName,
+        external_id: &ExternalId,
+    ) -> Result<Option<Reference>, StoreError> {
+        self.inner.find_external(map, external_id)
+    }
+
     fn patches(&self, id: ReferenceId) -> Result<PackedPatches, StoreError> {
         self.inner.patches(id)
     }
+
+    fn maps(&self) -> Result<Vec<MapInfo>, StoreError> {
+        self.inner.maps()
+    }
+
+    fn map(&self, name: &MapName) -> Result<MapInfo, StoreError> {
+        self.inner.map(name)
+    }
+
+    fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError> {
+        self.inner.head(map)
+    }
+
     fn scan_globals(
         &self,
         map: &MapName,
@@ -271,6 +274,32 @@ impl PlaceStore for Gated {
     ) -> Result<(), StoreError> {
         self.inner.scan_globals(map, visit)
     }
+}
+
+/// The writing part of a store whose deletions wait at the gate.
+struct GatedWriting {
+    inner: Arc<SqliteStore>,
+    gate: AtGate,
+}
+
+impl WritePlaces for GatedWriting {
+    fn delete(&self, id: ReferenceId) -> Result<Reference, StoreError> {
+        self.gate.wait();
+        self.inner.delete(id)
+    }
+
+    fn insert(&self, new: NewReference) -> Result<Inserted, StoreError> {
+        self.inner.insert(new)
+    }
+
+    fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, StoreError> {
+        self.inner.update(id, patch)
+    }
+
+    fn delete_map(&self, name: &MapName) -> Result<u64, StoreError> {
+        self.inner.delete_map(name)
+    }
+
     fn replace_globals(
         &self,
         map: &MapName,
@@ -279,9 +308,7 @@ impl PlaceStore for Gated {
     ) -> Result<(), StoreError> {
         self.inner.replace_globals(map, head, exchange)
     }
-    fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError> {
-        self.inner.head(map)
-    }
+
     fn set_calibration(
         &self,
         map: &MapName,
@@ -289,20 +316,21 @@ impl PlaceStore for Gated {
     ) -> Result<(), StoreError> {
         self.inner.set_calibration(map, calibration)
     }
-    fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError> {
-        self.inner.quarantined()
-    }
-    fn drain_damage(&self) -> Damage {
-        self.inner.drain_damage()
-    }
-    fn backup(&self, target: &Path) -> Result<u64, StoreError> {
-        self.inner.backup(target)
-    }
-    fn verify(&self) -> Result<VerifyReport, StoreError> {
-        self.inner.verify()
-    }
-    fn footprint(&self) -> Result<(u64, u64), StoreError> {
-        self.inner.footprint()
+}
+
+/// `store` with its listings and deletions waiting at `gate`.
+fn gated_store(store: SqliteStore, gate: AtGate) -> CombinedStore {
+    let inner = Arc::new(store);
+    CombinedStore {
+        reading: Arc::new(GatedReading {
+            inner: inner.clone(),
+            gate: gate.clone(),
+        }),
+        writing: Arc::new(GatedWriting {
+            inner: inner.clone(),
+            gate,
+        }),
+        maintenance: inner,
     }
 }
 
@@ -315,16 +343,14 @@ struct Flooded {
 }
 
 async fn gated() -> Flooded {
-    let (gate, arrived) = (Arc::new(Gate::default()), Arc::new(AtomicUsize::new(0)));
-    let (at_gate, arriving) = (gate.clone(), arrived.clone());
+    let gate = Arc::new(Gate::default());
+    let arrived = Arc::new(AtomicUsize::new(0));
+    let at_gate = AtGate {
+        gate: gate.clone(),
+        arrived: arrived.clone(),
+    };
     let app = App::around(
-        move |inner| {
-            Arc::new(Gated {
-                inner,
-                gate: at_gate,
-                arrived: arriving,
-            })
-        },
+        move |store| Arc::new(gated_store(store, at_gate)),
         Arc::new(tempfile::tempdir().unwrap()),
         FakeSource::new("fake-1"),
         |config| config.pipeline.max_wait_ms = 300,

@@ -1,7 +1,7 @@
 //! A damaged database behind a running service: what can be read is answered, the rest is reported.
 
 use crate::support::{App, FakeSource};
-use placeformer_store::{PlaceStore, SqliteStore, StoreConfig};
+use placeformer_store::{MaintainPlaces, SqliteStore, StoreConfig};
 use rand::{RngExt, SeedableRng};
 use rusqlite::Connection;
 use serde_json::Value;

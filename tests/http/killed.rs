@@ -6,7 +6,7 @@
 
 use crate::process::{Server, store_config};
 use crate::support::picture;
-use placeformer_store::{PlaceStore, SqliteStore, crash_points};
+use placeformer_store::{MaintainPlaces, SqliteStore, crash_points};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;

@@ -155,7 +155,7 @@ pub(super) fn serve_filled(
     let loaders = Loaders {
         source: Box::new(move || open_model(&extract)),
         store: Box::new(move || {
-            Ok(Arc::new(FilledStore::new(
+            Ok(Arc::new(FilledStore::around(
                 SqliteStore::open(&directory, &StoreConfig::default())?,
                 extra,
             )?))

@@ -5,9 +5,8 @@ use crate::pipeline::{IngestRequest, Parts, PipelineConfig, QueryOptions, QueryR
 use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt, stream};
 use placeformer_core::types::{MapName, ReferenceFields};
-use placeformer_lab::bench::filled::FilledStore;
 use placeformer_lab::bench::{MeasuredService, ServiceError, StartService};
-use placeformer_store::SqliteStore;
+use placeformer_store::CombinedStore;
 use placeformer_vision::extract::Extractor;
 use placeformer_vision::image::ImageConfig;
 use placeformer_vision::rerank::RerankConfig;
@@ -23,7 +22,7 @@ pub struct PipelineServices;
 impl StartService for PipelineServices {
     fn start(
         &self,
-        store: FilledStore<SqliteStore>,
+        store: CombinedStore,
         extractor: Arc<Extractor>,
     ) -> Result<Box<dyn MeasuredService>, ServiceError> {
         let runtime = Runtime::new()?;

@@ -8,7 +8,7 @@ use placeformer_core::types::{
     ContentHash, Descriptor, KeyPatches, MapName, ModelId, NewReference, PackedPatches,
     ReferenceFields, ReferenceId, SCALES, ScaleKeyPatches, ScaleSet,
 };
-use placeformer_store::{Inserted, PlaceStore, SqliteStore, StoreConfig};
+use placeformer_store::{Inserted, ReadPlaces, SqliteStore, StoreConfig, WritePlaces};
 use placeformer_vision::extract::pack;
 use placeformer_vision::rerank::{RerankConfig, Reranked, Reranker};
 use rayon::prelude::*;

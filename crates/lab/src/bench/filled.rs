@@ -5,34 +5,45 @@
 //! real ones; should one be asked for after all, it lends the patches of a real reference.
 
 use super::scenes::index_entry;
-use placeformer_core::types::{
-    Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
-};
+use placeformer_core::types::{ExternalId, MapName, PackedPatches, Reference, ReferenceId};
 use placeformer_store::{
-    Damage, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, PlaceStore, Quarantined,
-    ReferencePatch, StoreError, VerifyReport,
+    CombinedStore, GlobalRow, MapInfo, Page, PlaceStore, ReadPlaces, StoreError,
 };
 use rayon::prelude::*;
-use std::path::Path;
+use std::sync::Arc;
 
 /// References made up at once while an index is built.
 const BATCH: u64 = 16_384;
 
-/// A store and how many references each of its maps pretends to have in addition.
-pub struct FilledStore<S> {
-    store: S,
+/// The reading part of a store, and how many references each of its maps pretends to have in
+/// addition.
+pub struct FilledStore {
+    store: Arc<dyn ReadPlaces>,
     lenders: Vec<ReferenceId>,
     extra: u64,
 }
 
-impl<S: PlaceStore> FilledStore<S> {
-    /// Fills the maps of `store` up with `extra` references each.
+impl FilledStore {
+    /// `store` with its maps filled up with `extra` references each. It is written and maintained as
+    /// before.
     ///
     /// # Errors
     /// The store's.
-    pub fn new(store: S, extra: u64) -> Result<Self, StoreError> {
-        let lenders = store
-            .list(None, None, 1000)?
+    pub fn around<S: PlaceStore + 'static>(
+        store: S,
+        extra: u64,
+    ) -> Result<CombinedStore, StoreError> {
+        let whole = CombinedStore::of(Arc::new(store));
+        let filled = Self::new(whole.reading.clone(), extra)?;
+        Ok(CombinedStore {
+            reading: Arc::new(filled),
+            ..whole
+        })
+    }
+
+    fn new(store: Arc<dyn ReadPlaces>, extra: u64) -> Result<Self, StoreError> {
+        let page = store.list(None, None, 1000)?;
+        let lenders = page
             .references
             .into_iter()
             .map(|reference| reference.id)
@@ -56,16 +67,16 @@ impl<S: PlaceStore> FilledStore<S> {
     }
 }
 
-impl<S: PlaceStore> PlaceStore for FilledStore<S> {
-    fn insert(&self, new: NewReference) -> Result<Inserted, StoreError> {
-        self.store.insert(new)
-    }
-
+impl ReadPlaces for FilledStore {
     fn get(&self, id: ReferenceId) -> Result<Reference, StoreError> {
         Ok(Reference {
             id,
             ..self.store.get(self.real(id))?
         })
+    }
+
+    fn get_many(&self, ids: &[ReferenceId]) -> Result<Vec<Reference>, StoreError> {
+        ids.iter().map(|&id| self.get(id)).collect()
     }
 
     fn find_external(
@@ -74,14 +85,6 @@ impl<S: PlaceStore> PlaceStore for FilledStore<S> {
         external_id: &ExternalId,
     ) -> Result<Option<Reference>, StoreError> {
         self.store.find_external(map, external_id)
-    }
-
-    fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, StoreError> {
-        self.store.update(id, patch)
-    }
-
-    fn delete(&self, id: ReferenceId) -> Result<Reference, StoreError> {
-        self.store.delete(id)
     }
 
     fn list(
@@ -93,6 +96,10 @@ impl<S: PlaceStore> PlaceStore for FilledStore<S> {
         self.store.list(map, after, limit)
     }
 
+    fn patches(&self, id: ReferenceId) -> Result<PackedPatches, StoreError> {
+        self.store.patches(self.real(id))
+    }
+
     fn maps(&self) -> Result<Vec<MapInfo>, StoreError> {
         self.store.maps()
     }
@@ -101,16 +108,8 @@ impl<S: PlaceStore> PlaceStore for FilledStore<S> {
         self.store.map(name)
     }
 
-    fn delete_map(&self, name: &MapName) -> Result<u64, StoreError> {
-        self.store.delete_map(name)
-    }
-
-    fn get_many(&self, ids: &[ReferenceId]) -> Result<Vec<Reference>, StoreError> {
-        ids.iter().map(|&id| self.get(id)).collect()
-    }
-
-    fn patches(&self, id: ReferenceId) -> Result<PackedPatches, StoreError> {
-        self.store.patches(self.real(id))
+    fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError> {
+        self.store.head(map)
     }
 
     fn scan_globals(
@@ -134,47 +133,6 @@ impl<S: PlaceStore> PlaceStore for FilledStore<S> {
         }
         self.store.scan_globals(map, visit)
     }
-
-    fn replace_globals(
-        &self,
-        map: &MapName,
-        head: NewHead,
-        exchange: &mut dyn HeadExchange,
-    ) -> Result<(), StoreError> {
-        self.store.replace_globals(map, head, exchange)
-    }
-
-    fn head(&self, map: &MapName) -> Result<Option<Vec<u8>>, StoreError> {
-        self.store.head(map)
-    }
-
-    fn set_calibration(
-        &self,
-        map: &MapName,
-        calibration: Option<Calibration>,
-    ) -> Result<(), StoreError> {
-        self.store.set_calibration(map, calibration)
-    }
-
-    fn quarantined(&self) -> Result<Vec<Quarantined>, StoreError> {
-        self.store.quarantined()
-    }
-
-    fn drain_damage(&self) -> Damage {
-        self.store.drain_damage()
-    }
-
-    fn backup(&self, target: &Path) -> Result<u64, StoreError> {
-        self.store.backup(target)
-    }
-
-    fn verify(&self) -> Result<VerifyReport, StoreError> {
-        self.store.verify()
-    }
-
-    fn footprint(&self) -> Result<(u64, u64), StoreError> {
-        self.store.footprint()
-    }
 }
 
 #[cfg(test)]
@@ -182,9 +140,10 @@ mod tests {
     use super::*;
     use crate::bench::scenes::made_up_id;
     use placeformer_core::types::{
-        ContentHash, Descriptor, GLOBAL_DIM, ModelId, PatchGrid, PoolingStride, ReferenceFields,
+        ContentHash, Descriptor, GLOBAL_DIM, ModelId, NewReference, PatchGrid, PoolingStride,
+        ReferenceFields,
     };
-    use placeformer_store::{SqliteStore, StoreConfig};
+    use placeformer_store::{Inserted, SqliteStore, StoreConfig, WritePlaces};
 
     fn reference(map: &MapName) -> NewReference {
         let grid = PatchGrid {
@@ -224,7 +183,7 @@ mod tests {
         let Inserted::Created(real) = store.insert(reference(&map)).unwrap() else {
             panic!("the store was empty")
         };
-        let filled = FilledStore::new(store, 20_000).unwrap();
+        let filled = FilledStore::around(store, 20_000).unwrap();
         let mut seen = Vec::new();
         filled
             .scan_globals(&map, &mut |row| seen.push(row.reference))

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use placeformer_core::types::{
     ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, NewReference, ReferenceFields,
 };
-use placeformer_store::{PlaceStore, SqliteStore, StoreConfig, StoreError};
+use placeformer_store::{SqliteStore, StoreConfig, StoreError, WritePlaces};
 use placeformer_vision::extract::pack;
 use placeformer_vision::image::{ImageConfig, load_tensor};
 use std::fs::File;

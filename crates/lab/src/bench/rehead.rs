@@ -9,7 +9,9 @@ use placeformer_core::types::{
     ContentHash, Descriptor, GLOBAL_DIM, KeyPatches, ModelId, PatchGrid, PoolingStride,
     ScaleKeyPatches,
 };
-use placeformer_store::{HeadExchange, Inserted, NewHead, PlaceStore, SqliteStore, StoreConfig};
+use placeformer_store::{
+    HeadExchange, Inserted, NewHead, SqliteStore, StoreConfig, StoreError, WritePlaces,
+};
 use placeformer_vision::extract::Head;
 use placeformer_vision::extract::pack;
 use rayon::prelude::*;
@@ -105,10 +107,11 @@ fn fill(store: &SqliteStore, pooled_dim: usize) -> Result<(), BenchError> {
 struct Projecting<'a>(&'a Head);
 
 impl HeadExchange for Projecting<'_> {
-    fn project(&mut self, pooled: &[Vec<f32>]) -> Vec<Vec<f32>> {
-        pooled
+    fn project(&mut self, pooled: &[Vec<f32>]) -> Result<Vec<Vec<f32>>, StoreError> {
+        let globals = pooled
             .par_iter()
             .map(|pooled| self.0.project_stored(pooled))
-            .collect()
+            .collect();
+        Ok(globals)
     }
 }

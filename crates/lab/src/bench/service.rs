@@ -3,10 +3,9 @@
 //! The service is built upon this crate's neighbours and not below it, so that this crate cannot
 //! name it. Whoever can, the command line, passes it in.
 
-use super::filled::FilledStore;
 use bytes::Bytes;
 use placeformer_core::types::MapName;
-use placeformer_store::SqliteStore;
+use placeformer_store::CombinedStore;
 use placeformer_vision::extract::Extractor;
 use std::sync::Arc;
 
@@ -22,7 +21,7 @@ pub trait StartService {
     /// The service does not start.
     fn start(
         &self,
-        store: FilledStore<SqliteStore>,
+        store: CombinedStore,
         extractor: Arc<Extractor>,
     ) -> Result<Box<dyn MeasuredService>, ServiceError>;
 }

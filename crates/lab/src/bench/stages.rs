@@ -13,7 +13,7 @@ use placeformer_core::types::{
     ReferenceId,
 };
 use placeformer_kernels::scan::ROW_BYTES;
-use placeformer_store::{Inserted, PlaceStore, SqliteStore, StoreConfig, StoreError};
+use placeformer_store::{Inserted, ReadPlaces, SqliteStore, StoreConfig, StoreError, WritePlaces};
 use placeformer_vision::extract::{
     CandleEncoder, Encoder, EncoderSpec, ExtractError, Extractor, Geometry, Precision, VitWeights,
     build_encoder,
@@ -375,7 +375,7 @@ impl Bench<'_> {
         store: SqliteStore,
         extra: u64,
     ) -> Result<Box<dyn MeasuredService>, BenchError> {
-        let store = FilledStore::new(store, extra)?;
+        let store = FilledStore::around(store, extra)?;
         self.services
             .start(store, self.extractor.clone())
             .map_err(BenchError::Service)

@@ -1,0 +1,15 @@
+//! What every place store must do, asked of the embedded one through its public interface.
+
+#[path = "../../../../tests/common/places.rs"]
+mod places;
+#[path = "../../../../tests/common/small_disk.rs"]
+mod small_disk;
+mod support;
+
+mod combined;
+mod damage;
+mod full_disk;
+mod killed;
+mod maps;
+mod opening;
+mod references;
