@@ -33,7 +33,7 @@ const VERSION: u16 = 1;
 /// Bytes before the first patch.
 const HEADER: usize = 28;
 
-/// Bytes of a patch beside its descriptor: position, attention and factor.
+/// Bytes of a patch apart from its descriptor: position, attention and factor.
 const PATCH: usize = 2 + 2 + 4;
 
 /// Bytes of the checksum at the end.

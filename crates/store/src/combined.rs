@@ -1,8 +1,8 @@
 //! One store made of parts from several.
 //!
 //! A cache in front of a store, a measuring stand-in, or a store split over two services changes
-//! one part of what a store does. It implements that part alone, and takes the others from the store
-//! around which it is put.
+//! one part of what a store does. It implements that part alone, and takes the others from the
+//! store around which it is put.
 
 use crate::error::StoreError;
 use crate::records::{

@@ -15,8 +15,8 @@ pub struct StoreConfig {
     /// further readers wait until one is free.
     pub readers: usize,
     /// Page cache of each connection in KiB, 1 to 2147483647. There is one connection per reader
-    /// and one for the writer. Patches are read through the system's cache, so this one need not be
-    /// large.
+    /// and one for the writer. Patches are read through the system's cache, so this one need not
+    /// be large.
     pub cache_kib: u32,
     /// Size of a database page in bytes, a power of two from 4096 to 65536. It is fixed when the
     /// database is created; a later change has no effect on an existing database.
@@ -27,8 +27,8 @@ pub struct StoreConfig {
     pub log_bytes: u64,
     /// Bytes kept free on the disk so that deletes succeed when it is full. When a store is opened
     /// it takes at most a quarter of what the disk has left. A delete on a full disk gives the
-    /// reserve up. It is taken again as soon as the disk has room for at least half of it, and until
-    /// then new references are refused. 0 keeps nothing free.
+    /// reserve up. It is taken again as soon as the disk has room for at least half of it, and
+    /// until then new references are refused. 0 keeps nothing free.
     pub reserve_bytes: u64,
     /// Writes that may wait for the writer, 1 to 65536. Further ones block their caller.
     pub queue: usize,

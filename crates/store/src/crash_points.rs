@@ -1,12 +1,13 @@
 //! Named places at which the process can be made to die, for tests of durability.
 //!
-//! A store is only as good as its behaviour when the power goes between two writes. Tests therefore
-//! start a real process with `PLACEFORMER_CRASH_AT=name` or `name:nth`. The process aborts, without
-//! unwinding or flushing anything, when it reaches that place (for the nth time, counting from 1).
+//! A store is only as good as its behaviour when the power goes between two writes. Tests
+//! therefore start a real process with `PLACEFORMER_CRASH_AT=name` or `name:nth`. The process
+//! aborts, without unwinding or flushing anything, when it reaches that place (for the nth time,
+//! counting from 1).
 //!
-//! An environment variable must never be able to stop a production server. So the places exist only
-//! with the cargo feature `crash-points`, which tests turn on and which release builds lack. Without
-//! it the variable is never read and reaching a place compiles to nothing.
+//! An environment variable must never be able to stop a production server. So the places exist
+//! only with the cargo feature `crash-points`, which tests turn on and which release builds lack.
+//! Without it the variable is never read and reaching a place compiles to nothing.
 
 /// The environment variable that names the place to die at.
 pub const VARIABLE: &str = "PLACEFORMER_CRASH_AT";

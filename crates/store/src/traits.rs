@@ -25,9 +25,9 @@ impl<S: ReadPlaces + WritePlaces + MaintainPlaces + ?Sized> PlaceStore for S {}
 /// Reading maps and references.
 ///
 /// A reader sees a reference whole or not at all. A reference found damaged is quarantined: it is
-/// not served any more, and the call that found it fails with [`StoreError::CorruptRecord`] or leaves
-/// it out. Every method fails with [`StoreError::Damaged`] or [`StoreError::Engine`] if the database
-/// itself cannot be read.
+/// not served any more, and the call that found it fails with [`StoreError::CorruptRecord`] or
+/// leaves it out. Every method fails with [`StoreError::Damaged`] or [`StoreError::Engine`] if the
+/// database itself cannot be read.
 pub trait ReadPlaces: Send + Sync {
     /// One reference.
     ///
@@ -92,8 +92,8 @@ pub trait ReadPlaces: Send + Sync {
     /// References whose descriptor is damaged or lost are quarantined and left out.
     ///
     /// # Errors
-    /// The map does not exist or cannot be read to its end. What was visited until then is good, but
-    /// other references may be missing.
+    /// The map does not exist or cannot be read to its end. What was visited until then is good,
+    /// but other references may be missing.
     fn scan_globals(
         &self,
         map: &MapName,
@@ -116,8 +116,8 @@ pub trait WritePlaces: Send + Sync {
     /// descriptor breaks a rule of its type.
     fn insert(&self, new: NewReference) -> Result<Inserted, StoreError>;
 
-    /// Stores several, each with its own outcome, in their order. Not atomic as a whole; a store may
-    /// let them share syncs of the disk.
+    /// Stores several, each with its own outcome, in their order. Not atomic as a whole; a store
+    /// may let them share syncs of the disk.
     fn insert_many(&self, new: Vec<NewReference>) -> Vec<Result<Inserted, StoreError>> {
         new.into_iter().map(|new| self.insert(new)).collect()
     }
@@ -128,15 +128,15 @@ pub trait WritePlaces: Send + Sync {
     /// The reference does not exist or is damaged, or the new external id belongs to another.
     fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Result<Reference, StoreError>;
 
-    /// Deletes one reference and returns what it was. Of one whose own row is damaged only identity,
-    /// map and model are returned; the other fields are empty.
+    /// Deletes one reference and returns what it was. Of one whose own row is damaged only
+    /// identity, map and model are returned; the other fields are empty.
     ///
     /// # Errors
     /// The reference does not exist.
     fn delete(&self, id: ReferenceId) -> Result<Reference, StoreError>;
 
-    /// Deletes a map with everything in it, at once and atomically, and returns how many references
-    /// it had. Their room on disk is freed in the background.
+    /// Deletes a map with everything in it, at once and atomically, and returns how many
+    /// references it had. Their room on disk is freed in the background.
     ///
     /// # Errors
     /// The map does not exist.
@@ -144,8 +144,8 @@ pub trait WritePlaces: Send + Sync {
 
     /// Gives a map another head: `exchange` makes the new global vectors from the pooled ones.
     ///
-    /// Atomic: all references change to the new model or none. Reads and writes go on meanwhile. The
-    /// map's calibration is cleared.
+    /// Atomic: all references change to the new model or none. Reads and writes go on meanwhile.
+    /// The map's calibration is cleared.
     ///
     /// # Errors
     /// The map does not exist, is already being given another head, or `exchange` fails.
@@ -202,8 +202,8 @@ pub trait MaintainPlaces: Send + Sync {
 }
 
 /// What the caller of [`WritePlaces::replace_globals`] contributes: the projection itself, and
-/// whatever must follow the progress. A closure that makes one global vector from one pooled vector
-/// is one.
+/// whatever must follow the progress. A closure that makes one global vector from one pooled
+/// vector is one.
 pub trait HeadExchange {
     /// The new global vectors of pooled ones, in their order. A pooled vector is `[dim]` with unit
     /// length to half precision; a global vector is `[256]`. The caller answers for the pooled

@@ -1,5 +1,5 @@
-//! Image names that carry their own metadata, the convention of the common visual place recognition
-//! benchmarks:
+//! Image names that carry their own metadata, the convention of the common visual place
+//! recognition benchmarks:
 //!
 //! ```text
 //! @utm_east@utm_north@zone@band@lat@lon@pano@tile@heading@pitch@roll@height@time@note@.jpg
@@ -7,7 +7,8 @@
 //!
 //! Only the first two fields must be there; the rest may be empty or absent.
 
-use super::{GeoPoint, Heading, MetricPoint, UtmZone};
+use super::position::{GeoPoint, Heading};
+use super::utm_zone::{MetricPoint, UtmZone};
 use crate::invalid::InvalidValue;
 use time::{Date, Month, OffsetDateTime, PrimitiveDateTime, Time};
 

@@ -1,6 +1,6 @@
 //! Zones of the Universal Transverse Mercator grid, and points on it.
 
-use super::GeoPoint;
+use super::position::GeoPoint;
 use crate::invalid::InvalidValue;
 
 /// A point on a plane, in metres east and north of the plane's origin.

@@ -2,9 +2,9 @@
 //! that to yes or no.
 //!
 //! A [`Calibration`] holds two curves, because an answer that was not re-ranked has no S and needs
-//! an honest confidence of its own. It says how it was fitted and for which model and re-ranking it
-//! holds; anywhere else its numbers mean nothing. As JSON it is a file, a column of the store and a
-//! body of the web surface alike.
+//! an honest confidence of its own. It says how it was fitted and for which model and re-ranking
+//! it holds; anywhere else its numbers mean nothing. As JSON it is a file, a column of the store
+//! and a body of the web surface alike.
 
 use super::ids::{ModelId, RerankId};
 use crate::invalid::InvalidValue;
@@ -22,8 +22,8 @@ const LONGEST_DATA: usize = 200;
 pub struct ConfidenceWeights {
     /// Constant term.
     pub bias: f64,
-    /// Weight of ln(1 + S), not negative: more inliers never make an answer less sure. 0 in a curve
-    /// without S.
+    /// Weight of ln(1 + S), not negative: more inliers never make an answer less sure. 0 in a
+    /// curve without S.
     #[schema(minimum = 0)]
     pub score: f64,
     /// Weight of the global distance, not positive: a farther answer is never surer.
@@ -36,7 +36,31 @@ impl ConfidenceWeights {
     /// distance is right.
     pub fn confidence(&self, spatial_score: Option<f64>, global_distance: f64) -> f64 {
         let evidence = self.score * spatial_score.unwrap_or(0.0).max(0.0).ln_1p();
-        1.0 / (1.0 + (-(self.bias + evidence + self.distance * global_distance)).exp())
+        let logit = self.bias + evidence + self.distance * global_distance;
+        1.0 / (1.0 + (-logit).exp())
+    }
+
+    fn check(&self) -> Result<(), InvalidValue> {
+        let named = [
+            ("bias", self.bias),
+            ("score", self.score),
+            ("distance", self.distance),
+        ];
+        for (field, value) in named {
+            if !value.is_finite() {
+                let reason = format!("{value} is not a finite number");
+                return Err(InvalidValue::new(field, reason));
+            }
+        }
+        if self.score < 0.0 {
+            let reason = format!("{} would make more inliers less sure", self.score);
+            return Err(InvalidValue::new("score", reason));
+        }
+        if self.distance > 0.0 {
+            let reason = format!("{} would make farther answers surer", self.distance);
+            return Err(InvalidValue::new("distance", reason));
+        }
+        Ok(())
     }
 }
 
@@ -74,48 +98,20 @@ impl ConfidenceCurve {
     }
 
     fn check(&self) -> Result<(), InvalidValue> {
-        let ConfidenceWeights {
-            bias,
-            score,
-            distance,
-        } = self.weights;
-        let finite = [("bias", bias), ("score", score), ("distance", distance)];
-        if let Some((field, value)) = finite.into_iter().find(|(_, value)| !value.is_finite()) {
-            return Err(InvalidValue::new(
-                field,
-                format!("{value} is not a finite number"),
-            ));
-        }
-        if score < 0.0 {
-            return Err(InvalidValue::new(
-                "score",
-                format!("{score} would make more inliers less sure"),
-            ));
-        }
-        if distance > 0.0 {
-            return Err(InvalidValue::new(
-                "distance",
-                format!("{distance} would make farther answers surer"),
-            ));
-        }
-        let shares = [
-            ("threshold", self.threshold),
-            ("precision", self.precision),
-            ("recall", self.recall),
-            (
-                "expected_calibration_error",
-                self.expected_calibration_error,
-            ),
-        ];
-        shares
-            .into_iter()
-            .try_for_each(|(field, value)| share(field, value))
+        self.weights.check()?;
+        check_share("threshold", self.threshold)?;
+        check_share("precision", self.precision)?;
+        check_share("recall", self.recall)?;
+        check_share(
+            "expected_calibration_error",
+            self.expected_calibration_error,
+        )
     }
 }
 
 /// What turns the best answers of one model and one re-ranking into confidences.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-#[serde(try_from = "Unchecked", deny_unknown_fields)]
+#[serde(try_from = "UncheckedCalibration", deny_unknown_fields)]
 pub struct Calibration {
     /// Version of this JSON.
     #[schema(minimum = 1, maximum = 1)]
@@ -141,7 +137,7 @@ pub struct Calibration {
 /// The fields of a [`Calibration`] before they are checked.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Unchecked {
+struct UncheckedCalibration {
     format: u32,
     model: ModelId,
     rerank: RerankId,
@@ -151,10 +147,10 @@ struct Unchecked {
     global: ConfidenceCurve,
 }
 
-impl TryFrom<Unchecked> for Calibration {
+impl TryFrom<UncheckedCalibration> for Calibration {
     type Error = InvalidValue;
 
-    fn try_from(raw: Unchecked) -> Result<Self, Self::Error> {
+    fn try_from(raw: UncheckedCalibration) -> Result<Self, Self::Error> {
         if raw.format != FORMAT {
             let reason = format!("{} is not known; this release reads {FORMAT}", raw.format);
             return Err(InvalidValue::new("format", reason));
@@ -170,8 +166,10 @@ impl TryFrom<Unchecked> for Calibration {
 }
 
 impl Calibration {
-    /// Checks that every number is finite and in its range. `curves` are that of re-ranked answers
-    /// and that of answers by distance alone.
+    /// A calibration of two curves: for re-ranked answers, and for answers by distance alone.
+    ///
+    /// # Errors
+    /// Names the first number that is not finite or not in its range.
     pub fn new(
         model: ModelId,
         rerank: RerankId,
@@ -181,12 +179,10 @@ impl Calibration {
     ) -> Result<Self, InvalidValue> {
         let data = data.into();
         if data.chars().count() > LONGEST_DATA {
-            return Err(InvalidValue::new(
-                "data",
-                format!("it has more than {LONGEST_DATA} characters"),
-            ));
+            let reason = format!("it has more than {LONGEST_DATA} characters");
+            return Err(InvalidValue::new("data", reason));
         }
-        share("target_precision", target_precision)?;
+        check_share("target_precision", target_precision)?;
         curves.iter().try_for_each(ConfidenceCurve::check)?;
         let [reranked, global] = curves;
         if global.weights.score != 0.0 {
@@ -237,15 +233,12 @@ impl Calibration {
 }
 
 /// Checks that a value lies in 0 to 1; NaN does not.
-fn share(field: &'static str, value: f64) -> Result<(), InvalidValue> {
+fn check_share(field: &'static str, value: f64) -> Result<(), InvalidValue> {
     if (0.0..=1.0).contains(&value) {
-        Ok(())
-    } else {
-        Err(InvalidValue::new(
-            field,
-            format!("{value} is outside 0 to 1"),
-        ))
+        return Ok(());
     }
+    let reason = format!("{value} is outside 0 to 1");
+    Err(InvalidValue::new(field, reason))
 }
 
 #[cfg(test)]
@@ -255,13 +248,28 @@ mod tests {
     use serde_json::{Value, json};
 
     fn curve(score: f64) -> Value {
-        json!({"weights": {"bias": -4.5, "score": score, "distance": -2.25}, "threshold": 0.75, "right": 90,
-            "wrong": 40, "without_match": 30, "precision": 0.99, "recall": 0.875, "expected_calibration_error": 0.02})
+        json!({
+            "weights": {"bias": -4.5, "score": score, "distance": -2.25},
+            "threshold": 0.75,
+            "right": 90,
+            "wrong": 40,
+            "without_match": 30,
+            "precision": 0.99,
+            "recall": 0.875,
+            "expected_calibration_error": 0.02
+        })
     }
 
     fn whole() -> Value {
-        json!({"format": 1, "model": "m", "rerank": "r", "data": "town", "target_precision": 0.99,
-            "reranked": curve(1.5), "global": curve(0.0)})
+        json!({
+            "format": 1,
+            "model": "m",
+            "rerank": "r",
+            "data": "town",
+            "target_precision": 0.99,
+            "reranked": curve(1.5),
+            "global": curve(0.0)
+        })
     }
 
     #[test]
@@ -326,12 +334,19 @@ mod tests {
         assert!(built.unwrap_err().to_string().contains("bias"));
     }
 
+    /// Two numbers below `end`, the smaller first.
+    fn ordered(end: f64) -> impl Strategy<Value = (f64, f64)> {
+        (0.0..end, 0.0..end).prop_map(|(a, b)| (a.min(b), a.max(b)))
+    }
+
     proptest! {
         #[test]
         fn confidence_is_a_probability_that_follows_the_evidence(
-            bias in -50.0..50.0f64, score in 0.0..10.0f64, distance in -20.0..0.0f64,
-            (fewer, more) in (0.0..2000.0f64, 0.0..2000.0f64).prop_map(|(a, b)| (a.min(b), a.max(b))),
-            (near, far) in (0.0..2.0f64, 0.0..2.0f64).prop_map(|(a, b)| (a.min(b), a.max(b))),
+            bias in -50.0..50.0f64,
+            score in 0.0..10.0f64,
+            distance in -20.0..0.0f64,
+            (fewer, more) in ordered(2000.0),
+            (near, far) in ordered(2.0),
         ) {
             let weights = ConfidenceWeights { bias, score, distance };
             let confidence = weights.confidence(Some(fewer), far);

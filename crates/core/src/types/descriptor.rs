@@ -63,7 +63,8 @@ pub struct ImageTensor {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum PoolingStride {
-    /// As far as the kernel is wide: windows do not overlap, trailing rows and columns are dropped.
+    /// As far as the kernel is wide: windows do not overlap, trailing rows and columns are
+    /// dropped.
     #[default]
     Kernel,
     /// One patch.
@@ -134,9 +135,11 @@ pub struct KeyPatches {
     pub scales: [ScaleKeyPatches; SCALES],
 }
 
-/// Key patches of all scales as they are matched and stored: int8 descriptors, one f32 factor each.
+/// Key patches of all scales as they are matched and stored: int8 descriptors, one f32 factor
+/// each.
 ///
-/// Rows of scale 1 come first, then 2, then 3, so that a union of neighbouring scales is one slice.
+/// Rows of scale 1 come first, then 2, then 3, so that a union of neighbouring scales is one
+/// slice.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PackedPatches {
     /// The grid they index.

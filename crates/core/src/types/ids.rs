@@ -7,8 +7,8 @@ use std::fmt;
 use std::str::FromStr;
 use uuid::Uuid;
 
-/// Identifies one reference for its whole life. Time-ordered (UUID version 7), so inserts append to
-/// indexes.
+/// Identifies one reference for its whole life. Time-ordered (UUID version 7), so inserts append
+/// to indexes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct ReferenceId(Uuid);

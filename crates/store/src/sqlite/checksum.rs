@@ -1,8 +1,8 @@
 //! The checksum that every row carries.
 //!
 //! It covers each column with a tag for its presence and its length, so that no two different rows
-//! share their bytes. It covers the row's number and the table's name as well, so that a row cannot
-//! pass for another.
+//! share their bytes. It covers the row's number and the table's name as well, so that a row
+//! cannot pass for another.
 
 /// A CRC-32 of a row, fed column by column.
 pub(super) struct RowChecksum(crc32fast::Hasher);

@@ -42,8 +42,8 @@ impl Database {
         self.count_damage(pending.wait())
     }
 
-    /// Counts damage for which no single reference stands; that of a reference is counted when it is
-    /// quarantined.
+    /// Counts damage for which no single reference stands; that of a reference is counted when it
+    /// is quarantined.
     fn count_damage<T>(&self, outcome: Result<T, StoreError>) -> Result<T, StoreError> {
         if let Err(
             error @ (StoreError::Damaged { .. }
@@ -80,7 +80,7 @@ impl Database {
         }
         let id = damaged.id;
         let reason = damaged.reason.as_str();
-        tracing::error!(reference = %id, reason, "a stored reference is damaged; it is quarantined");
+        tracing::error!(reference = %id, reason, "a stored reference is damaged and quarantined");
         let record = move |connection: &Connection| quarantine::record(connection, &damaged);
         if let Err(error) = self.writer.run(Effect::Shrinks, record) {
             // It stays out of service while this process lives, and the next will find it again.

@@ -69,8 +69,8 @@ impl DataDirectory {
     }
 }
 
-/// Which process says in the lock file that the lock is its own; empty if that cannot be read. That
-/// the directory is locked is certain without it.
+/// Which process says in the lock file that the lock is its own; empty if that cannot be read.
+/// That the directory is locked is certain without it.
 fn read_owner(lock: &File) -> String {
     let mut owner = String::new();
     let _ = lock.take(100).read_to_string(&mut owner);

@@ -1,9 +1,9 @@
 //! How connections to the database are opened, and what the engine's errors mean to us.
 //!
 //! Write-ahead logging lets readers go on while the one writer writes; `synchronous = FULL` syncs
-//! the log on every commit. Readers are opened read-only, so that no read path can ever write. Pages
-//! are large because most bytes are patch blobs of a hundred kilobytes: fewer overflow pages to
-//! chain through.
+//! the log on every commit. Readers are opened read-only, so that no read path can ever write.
+//! Pages are large because most bytes are patch blobs of a hundred kilobytes: fewer overflow pages
+//! to chain through.
 
 use crate::config::StoreConfig;
 use crate::error::{EngineCause, StoreError};
@@ -81,8 +81,8 @@ pub(super) fn damage(error: &SqliteError) -> Option<String> {
     is_damage.then(|| error.to_string())
 }
 
-/// Opens the writing connection, creating the database if there is none. The log is folded into the
-/// database when it has reached `log_bytes`.
+/// Opens the writing connection, creating the database if there is none. The log is folded into
+/// the database when it has reached `log_bytes`.
 pub(super) fn open_writer(
     path: &Path,
     config: &StoreConfig,

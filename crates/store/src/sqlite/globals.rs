@@ -1,6 +1,6 @@
 //! Streaming the global vectors of a map, from which its index is rebuilt.
 //!
-//! One statement reads them all. Three kinds of damage are told apart: a row that fails its
+//! One statement reads them all. Three kinds of damage are distinguished: a row that fails its
 //! checksum is quarantined by the scan; a reference without a vector shows as a difference between
 //! the count of vectors and that of references; and where the engine cannot read a page of the
 //! database, the scan goes on reference by reference.
@@ -67,8 +67,8 @@ impl GlobalColumns {
 }
 
 impl Database {
-    /// Visits the global vectors of a map out of one snapshot, and quarantines references that have
-    /// none.
+    /// Visits the global vectors of a map out of one snapshot, and quarantines references that
+    /// have none.
     pub(super) fn scan_globals(
         &self,
         connection: &Connection,
@@ -147,8 +147,9 @@ impl Database {
     /// global vector.
     ///
     /// Looking for them takes long, so it is done only if there can be any: if the scan read fewer
-    /// vectors than the map has references, or found a damaged row. The number in a damaged row may
-    /// be wrong, so that the row counts for another reference and the counts agree by accident.
+    /// vectors than the map has references, or found a damaged row. The number in a damaged row
+    /// may be wrong, so that the row counts for another reference and the counts agree by
+    /// accident.
     fn quarantine_lost_globals(
         &self,
         connection: &Connection,

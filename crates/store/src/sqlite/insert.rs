@@ -1,8 +1,8 @@
 //! Storing a reference: its map on first use, its row, and the three parts of its descriptor, in
 //! one transaction.
 //!
-//! All inserts pass through the one writer, so that of two callers with one external id exactly one
-//! creates it.
+//! All inserts pass through the one writer, so that of two callers with one external id exactly
+//! one creates it.
 
 use super::engine::failed;
 use super::keys::ReferenceNumber;
@@ -23,7 +23,7 @@ use placeformer_core::types::{
 use rusqlite::Connection;
 use time::OffsetDateTime;
 
-/// Bytes that a reference takes beside its descriptor, about.
+/// Bytes that a reference takes in addition to its descriptor, about.
 const ROW_BYTES: usize = 1024;
 
 /// A reference as bytes, made on the caller's thread so that the writer only writes.

@@ -69,8 +69,8 @@ impl<T> Pending<T> {
     }
 }
 
-/// Makes a job of `work` and the place where its answer arrives. The work may run more than once, so
-/// it must not keep state between runs.
+/// Makes a job of `work` and the place where its answer arrives. The work may run more than once,
+/// so it must not keep state between runs.
 pub(super) fn job<T: Send + 'static>(
     effect: Effect,
     work: impl FnMut(&Connection) -> Result<T, StoreError> + Send + 'static,

@@ -115,8 +115,8 @@ impl MapRow {
 
     /// The map's calibration, if it has one that this release can read.
     ///
-    /// The row's checksum says that its bytes are as they were written. So a calibration that cannot
-    /// be read was written by another release, and the map goes on without it.
+    /// The row's checksum says that its bytes are as they were written. So a calibration that
+    /// cannot be read was written by another release, and the map goes on without it.
     pub(super) fn calibration(&self) -> Option<Calibration> {
         let text = self.calibration.as_deref()?;
         match serde_json::from_str(text) {

@@ -1,8 +1,8 @@
 //! The schema's history, carried in the program and applied forward only.
 //!
-//! Each migration runs in a transaction of its own together with the row that records it, so that a
-//! crash leaves it applied or not, never half. A database that is ahead of this release, or whose
-//! past differs, is refused untouched.
+//! Each migration runs in a transaction of its own together with the row that records it, so that
+//! a crash leaves it applied or not, never half. A database that is ahead of this release, or
+//! whose past differs, is refused untouched.
 
 use super::engine::failed;
 use crate::crash_points;

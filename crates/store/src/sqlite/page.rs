@@ -1,8 +1,8 @@
 //! Listing references page by page.
 //!
-//! A page is read in one statement. If the engine cannot read a page of the database on the way, the
-//! list goes on reference by reference, with the identities out of an index, so that one damaged
-//! database page does not hide the references on the others.
+//! A page is read in one statement. If the engine cannot read a page of the database on the way,
+//! the list goes on reference by reference, with the identities out of an index, so that one
+//! damaged database page does not hide the references on the others.
 
 use super::database::Database;
 use super::engine::failed;

@@ -1,7 +1,7 @@
 //! The parts of a descriptor, and a map's head: their checksums, and reading them.
 //!
-//! A part's checksum covers the number of its reference, and a global vector's also its version, so
-//! that neither a part of another reference nor an outdated one can pass for it.
+//! A part's checksum covers the number of its reference, and a global vector's also its version,
+//! so that neither a part of another reference nor an outdated one can pass for it.
 
 use super::checksum::RowChecksum;
 use super::keys::{ReferenceNumber, Version};

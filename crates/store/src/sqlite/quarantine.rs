@@ -2,8 +2,8 @@
 //! them.
 //!
 //! While the process lives the mirror is the authority, because the disk may be too full to record
-//! a find. It also keeps what was found since the store's user last asked. So damage is counted and
-//! leaves the user's index whichever call found it.
+//! a find. It also keeps what was found since the store's user last asked. So damage is counted
+//! and leaves the user's index whichever call found it.
 
 use super::engine::failed;
 use super::keys::{MapNumber, ReferenceNumber};
@@ -82,8 +82,8 @@ impl Quarantine {
         true
     }
 
-    /// Counts damage that no quarantined reference stands for, such as a reference that cannot even
-    /// be located. The same find, named by `what`, is counted once.
+    /// Counts damage that no quarantined reference stands for, such as a reference that cannot
+    /// even be located. The same find, named by `what`, is counted once.
     pub(super) fn count_other(&self, what: String, reference: Option<ReferenceId>) {
         self.report(|unreported| {
             if unreported.counted.len() < REMEMBERED && unreported.counted.insert(what) {
@@ -93,8 +93,8 @@ impl Quarantine {
         });
     }
 
-    /// Takes out a damaged reference that its image, sent again, has replaced. `id` is what its row
-    /// said, and reported in case the damage was not known before.
+    /// Takes out a damaged reference that its image, sent again, has replaced. `id` is what its
+    /// row said, and reported in case the damage was not known before.
     pub(super) fn replaced(&self, number: ReferenceNumber, id: ReferenceId) {
         let known = self.write().remove(&number);
         self.report(|unreported| {

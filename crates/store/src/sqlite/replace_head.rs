@@ -1,5 +1,5 @@
-//! Giving a map another head: new global vectors from the pooled vectors that are kept, without the
-//! images.
+//! Giving a map another head: new global vectors from the pooled vectors that are kept, without
+//! the images.
 //!
 //! The new vectors are written as another version, batch by batch, while queries and inserts go on
 //! with the old ones. One last small transaction makes the map use the new version and binds it to
@@ -48,12 +48,13 @@ struct Exchange {
 struct Source {
     number: ReferenceNumber,
     pooled: Vec<f32>,
-    /// What an index needs of the reference, its global vector still empty; none if the reference is
-    /// not served.
+    /// What an index needs of the reference, its global vector still empty; none if the reference
+    /// is not served.
     row: Option<GlobalRow>,
 }
 
-/// References read together; the damaged ones among them are quarantined and left without a vector.
+/// References read together; the damaged ones among them are quarantined and left without a
+/// vector.
 struct Batch {
     sources: Vec<Source>,
     /// The greatest number read; none if there was nothing left to read.
@@ -78,8 +79,8 @@ impl Database {
         })?;
         let converted = self.convert_all(&begun, exchange);
         if converted.is_err() {
-            // The caller needs the error that stopped the exchange. If abandoning it fails as well,
-            // the next start does that.
+            // The caller needs the error that stopped the exchange. If abandoning it fails as
+            // well, the next start does that.
             let _ = self.writer.run(Effect::Shrinks, move |connection| {
                 abandon(connection, &begun)
             });
@@ -208,7 +209,8 @@ fn check_projected(pooled: &[Vec<f32>], globals: &[Vec<f32>]) -> Result<(), Stor
     globals.iter().try_for_each(|global| check_global(global))
 }
 
-/// Where the columns of a reference and its pooled vector are in a statement, found by their names.
+/// Where the columns of a reference and its pooled vector are in a statement, found by their
+/// names.
 struct PooledColumns {
     reference: ReferenceColumns,
     vector: usize,

@@ -2,9 +2,9 @@
 //!
 //! Even deleting needs room, for the log must grow before the database can shrink. So a file of
 //! zeros, `reserve`, lies in the data directory. When a delete finds the disk full, the file is
-//! removed; until it can be restored nothing new is taken in, so that the room serves deletes only.
-//! The log is folded into the database at a quarter of the reserve's size, so that giving up the
-//! reserve always leaves room for that.
+//! removed; until it can be restored nothing new is taken in, so that the room serves deletes
+//! only. The log is folded into the database at a quarter of the reserve's size, so that giving up
+//! the reserve always leaves room for that.
 
 use super::directory::io;
 use crate::config::StoreConfig;

@@ -53,8 +53,8 @@ pub(super) fn blob<'r>(row: &'r Row<'_>, column: impl RowIndex) -> Result<&'r [u
     row.get_ref(column)?.as_blob().map_err(RowError::damaged)
 }
 
-/// The identity in column `id` of a row that may be unreadable otherwise; all zeros if even that is
-/// lost.
+/// The identity in column `id` of a row that may be unreadable otherwise; all zeros if even that
+/// is lost.
 pub(super) fn id_or_zeros(id: rusqlite::Result<[u8; 16]>) -> ReferenceId {
     ReferenceId::from_bytes(id.unwrap_or([0; 16]))
 }

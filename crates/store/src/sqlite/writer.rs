@@ -1,13 +1,13 @@
 //! The one thread that writes, and how many writers share one sync of the disk.
 //!
-//! Callers hand in jobs and wait. The thread takes the first job and all that wait by then. It runs
-//! them in one transaction, each under a savepoint of its own, commits once, and only then answers
-//! every caller. While the disk syncs, the next group gathers by itself; an idle store commits a
-//! lone job at once. A job that fails undoes itself only. If the group as a whole fails, each job is
-//! tried again alone, so that no caller suffers from the fault of another.
+//! Callers hand in jobs and wait. The thread takes the first job and all that wait by then. It
+//! runs them in one transaction, each under a savepoint of its own, commits once, and only then
+//! answers every caller. While the disk syncs, the next group gathers by itself; an idle store
+//! commits a lone job at once. A job that fails undoes itself only. If the group as a whole fails,
+//! each job is tried again alone, so that no caller suffers from the fault of another.
 //!
-//! On a full disk the log is folded into the database and the job tried once more; deletes may then
-//! use up the [`Reserve`], and until it can be restored jobs that grow the store are refused.
+//! On a full disk the log is folded into the database and the job tried once more; deletes may
+//! then use up the [`Reserve`], and until it can be restored jobs that grow the store are refused.
 
 use super::engine::failed;
 use super::job::{Effect, Job, Pending, job};
@@ -232,8 +232,8 @@ impl Worker {
         outcome
     }
 
-    /// Runs every job under a savepoint, and undoes those that fail. An error means that all of them
-    /// have to start over.
+    /// Runs every job under a savepoint, and undoes those that fail. An error means that all of
+    /// them have to start over.
     fn run_all(&self, jobs: &mut [Box<dyn Job>]) -> Result<(), StoreError> {
         for job in jobs {
             self.execute("SAVEPOINT job")?;

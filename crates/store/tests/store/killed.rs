@@ -17,8 +17,8 @@ const DIRECTORY: &str = "PLACEFORMER_TEST_DIRECTORY";
 /// The head that the map gets.
 const HEAD: &[u8] = b"stands for the head that the map keeps";
 
-/// Prints a line for the parent. The test harness captures what `println!` prints, so it is written
-/// to the standard output itself.
+/// Prints a line for the parent. The test harness captures what `println!` prints, so it is
+/// written to the standard output itself.
 fn print(line: &str) {
     std::io::stdout()
         .write_all(format!("{line}\n").as_bytes())
