@@ -80,7 +80,11 @@ impl Database {
         }
         let id = damaged.id;
         let reason = damaged.reason.as_str();
-        tracing::error!(reference = %id, reason, "a stored reference is damaged and quarantined");
+        tracing::error!(
+            reference = %id,
+            reason,
+            "a stored reference is damaged; it is quarantined"
+        );
         let record = move |connection: &Connection| quarantine::record(connection, &damaged);
         if let Err(error) = self.writer.run(Effect::Shrinks, record) {
             // It stays out of service while this process lives, and the next will find it again.
