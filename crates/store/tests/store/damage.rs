@@ -203,7 +203,8 @@ fn a_damaged_reference_can_be_deleted() {
     let city = map("city");
     let directory = tempfile::tempdir().unwrap();
     let store = open(directory.path());
-    let (new, kept) = (reference(&city, 1), create(&store, reference(&city, 2)));
+    let new = reference(&city, 1);
+    let kept = create(&store, reference(&city, 2));
     let created = create(&store, new.clone());
     drop(store);
     flip(directory.path(), &new.content_hash.0);
@@ -258,71 +259,87 @@ fn a_calibration_changed_on_the_disk_is_noticed() {
     );
 }
 
+/// What a store with one flipped bit did when it was read.
+#[derive(Debug, PartialEq, Eq)]
+enum Reading {
+    /// It could not be opened.
+    Refused,
+    /// Every answer was there and right.
+    Sound,
+    /// Something could not be read, and verify says what is damaged.
+    FoundDamaged,
+}
+
+/// Reads everything that `stored` says must be there. Whatever is answered must be right.
+fn read_all(directory: &Path, stored: &[(Reference, NewReference)], what: &str) -> Reading {
+    let Ok(store) = SqliteStore::open(directory, &config()) else {
+        return Reading::Refused;
+    };
+    let mut is_complete = true;
+    for (reference, new) in stored {
+        match store.get(reference.id) {
+            Ok(found) => assert_eq!(&found, reference, "{what}"),
+            Err(_) => is_complete = false,
+        }
+        match store.patches(reference.id) {
+            Ok(patches) => assert_eq!(patches, new.descriptor.patches, "{what}"),
+            Err(_) => is_complete = false,
+        }
+    }
+    let mut vectors = 0;
+    let scanned = store.scan_globals(&map("city"), &mut |row| {
+        let (_, new) = stored
+            .iter()
+            .find(|(reference, _)| reference.id == row.reference)
+            .unwrap();
+        assert_eq!(row.global, new.descriptor.global, "{what}");
+        vectors += 1;
+    });
+    if is_complete && scanned.is_ok() && vectors == stored.len() {
+        return Reading::Sound;
+    }
+    let is_noticed = match store.verify() {
+        Ok(report) => !report.damaged.is_empty() || !report.engine_errors.is_empty(),
+        Err(_) => true,
+    };
+    assert!(
+        is_noticed,
+        "{what} hides a reference and verify finds nothing"
+    );
+    Reading::FoundDamaged
+}
+
 #[test]
 fn a_bit_flipped_anywhere_never_changes_an_answer_unnoticed() {
-    let city = map("city");
     let pristine = tempfile::tempdir().unwrap();
     let store = open(pristine.path());
     let stored: Vec<_> = (0..12)
         .map(|seed| {
-            let new = named_reference(&city, &format!("photo {seed}"), seed);
+            let new = named_reference(&map("city"), &format!("photo {seed}"), seed);
             (create(&store, new.clone()), new)
         })
         .collect();
     drop(store);
     let content = fs::read(database(pristine.path())).unwrap();
-    // Only where there is something: a flip in an empty part of a page says nothing.
+    // Only bytes that are used: a flip in an empty part of a page says nothing.
     let filled: Vec<usize> = (0..content.len()).filter(|&at| content[at] != 0).collect();
     let seed = 20_240_817;
     println!("seed {seed}");
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-    let (mut refused, mut found) = (0, 0);
+    let mut refused = 0;
+    let mut found = 0;
     for round in 0..120 {
         let directory = tempfile::tempdir().unwrap();
-        let (at, bit) = (
-            filled[random.random_range(0..filled.len())],
-            random.random_range(0..8),
-        );
+        let at = filled[random.random_range(0..filled.len())];
+        let bit = random.random_range(0..8);
         let mut damaged = content.clone();
         damaged[at] ^= 1 << bit;
         fs::write(database(directory.path()), damaged).unwrap();
-        let Ok(store) = SqliteStore::open(directory.path(), &config()) else {
-            refused += 1;
-            continue;
-        };
-        let mut unserved = 0;
-        for (reference, new) in &stored {
-            let what = format!("round {round}: bit {bit} of byte {at}");
-            match store.get(reference.id) {
-                Ok(there) => assert_eq!(&there, reference, "{what}"),
-                Err(_) => unserved += 1,
-            }
-            match store.patches(reference.id) {
-                Ok(patches) => assert_eq!(patches, new.descriptor.patches, "{what}"),
-                Err(_) => unserved += 1,
-            }
-        }
-        let mut vectors = 0;
-        let scanned = store.scan_globals(&city, &mut |row| {
-            let (_, new) = stored
-                .iter()
-                .find(|(reference, _)| reference.id == row.reference)
-                .unwrap();
-            assert_eq!(
-                row.global, new.descriptor.global,
-                "round {round}: bit {bit} of byte {at}"
-            );
-            vectors += 1;
-        });
-        if unserved > 0 || scanned.is_err() || vectors < stored.len() {
-            found += 1;
-            let noticed = store.verify().map_or(true, |report| {
-                !report.damaged.is_empty() || !report.engine_errors.is_empty()
-            });
-            assert!(
-                noticed,
-                "round {round}: bit {bit} of byte {at} hides a reference and verify finds nothing"
-            );
+        let what = format!("round {round}: bit {bit} of byte {at}");
+        match read_all(directory.path(), &stored, &what) {
+            Reading::Refused => refused += 1,
+            Reading::FoundDamaged => found += 1,
+            Reading::Sound => {}
         }
     }
     println!("{refused} refused at opening, {found} found damaged");

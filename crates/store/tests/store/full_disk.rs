@@ -21,7 +21,8 @@ fn a_full_disk_refuses_new_references_but_serves_and_deletes() {
     let Some(disk) = SmallDisk::mount() else {
         return;
     };
-    let (city, other) = (map("city"), map("other"));
+    let city = map("city");
+    let other = map("other");
     let store = SqliteStore::open(disk.path(), &StoreConfig::default()).unwrap();
     for round in 0..3 {
         let mut ids = Vec::new();

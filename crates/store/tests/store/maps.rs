@@ -28,7 +28,8 @@ fn a_map_is_bound_to_one_model() {
 #[test]
 fn a_deleted_map_vanishes_at_once_and_its_room_is_used_again() {
     let (directory, store) = fresh();
-    let (city, other) = (map("city"), map("other"));
+    let city = map("city");
+    let other = map("other");
     let new: Vec<_> = (0..300).map(|seed| reference(&city, seed)).collect();
     let created: Vec<_> = store
         .insert_many(new)
@@ -136,7 +137,8 @@ fn another_head_replaces_all_vectors_or_none_while_the_map_grows() {
 #[test]
 fn a_map_keeps_its_head_until_it_gets_another_or_goes() {
     let (directory, store) = fresh();
-    let (city, other) = (map("city"), map("other"));
+    let city = map("city");
+    let other = map("other");
     create(&store, reference(&city, 1));
     create(&store, reference(&other, 1));
     let mut project = |pooled: &[f32]| pooled[..GLOBAL_DIM].to_vec();
@@ -196,7 +198,8 @@ fn a_map_keeps_its_head_until_it_gets_another_or_goes() {
 #[test]
 fn a_calibration_is_kept_with_its_map_and_only_if_it_is_of_its_model() {
     let (directory, store) = fresh();
-    let (city, other) = (map("city"), map("other"));
+    let city = map("city");
+    let other = map("other");
     create(&store, reference(&city, 1));
     create(&store, reference(&other, 1));
     let kept = |store: &SqliteStore, map: &MapName| store.map(map).unwrap().calibration;

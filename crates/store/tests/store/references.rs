@@ -52,7 +52,8 @@ fn what_is_stored_is_found_again_also_after_reopening() {
 #[test]
 fn absent_things_are_named() {
     let (_directory, store) = fresh();
-    let (nowhere, nobody) = (map("nowhere"), ReferenceId::generate());
+    let nowhere = map("nowhere");
+    let nobody = ReferenceId::generate();
     let codes = [
         store.get(nobody).unwrap_err().code(),
         store.patches(nobody).unwrap_err().code(),
@@ -110,7 +111,9 @@ fn concurrent_creates_of_one_external_id_yield_one_reference() {
     for round in 0..20 {
         let name = format!("photo {round}");
         let outcomes: Vec<_> = std::thread::scope(|scope| {
-            let (store, city, name) = (&store, &city, &name);
+            let store = &store;
+            let city = &city;
+            let name = &name;
             let threads: Vec<_> = (0..4)
                 .map(|_| {
                     scope.spawn(move || store.insert(named_reference(city, name, round)).unwrap())
@@ -160,13 +163,15 @@ fn descriptors_that_break_their_rules_are_refused() {
 #[test]
 fn pages_cover_everything_once_and_in_order() {
     let (_directory, store) = fresh();
-    let (a, b) = (map("a"), map("b"));
+    let a = map("a");
+    let b = map("b");
     let all: Vec<ReferenceId> = (0..25)
         .map(|seed| create(&store, reference(if seed % 3 == 0 { &b } else { &a }, seed)).id)
         .collect();
     for (chosen, expected) in [(None, 25), (Some(&a), 16), (Some(&b), 9)] {
         for limit in [1, 4, 8, 9, 25, 100] {
-            let (mut ids, mut after) = (Vec::new(), None);
+            let mut ids = Vec::new();
+            let mut after = None;
             loop {
                 let page = store.list(chosen, after, limit).unwrap();
                 assert!(page.references.len() <= limit);
@@ -273,7 +278,8 @@ fn readers_see_references_whole_while_writers_write() {
     std::thread::scope(|scope| {
         let writers: Vec<_> = (0..3u64)
             .map(|writer| {
-                let (store, city) = (&store, &city);
+                let store = &store;
+                let city = &city;
                 scope.spawn(move || {
                     for step in 0..40 {
                         let created = create(store, reference(city, writer * 1000 + step + 1));
