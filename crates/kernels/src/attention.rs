@@ -10,13 +10,13 @@ mod layout;
 
 use super::Simd;
 use super::elementwise::{Epilogue, Product, exponentiate_row, finish_block, scale_rows};
-use super::gemm::{Panel, PanelCodes, Tiling, multiply_panel};
+use super::gemm::{PanelCodes, RightPanel, Tiling, multiply_panel};
 use super::greatest_common_divisor;
-use super::operand::{Format, Left, OperandBuffer, Rows};
+use super::operand::{Format, LeftOperand, OperandBuffer, WordRows};
 use super::simd::SimdLevel;
 use layout::head_queries;
 pub use layout::{
-    AttentionShape, Place, store_key_codes, store_keys, store_query_codes, store_values,
+    AttentionShape, BlockPosition, store_key_codes, store_keys, store_query_codes, store_values,
 };
 
 /// Tokens of a chunk, whole register tiles and whole key panels, where `images` of so many tokens
@@ -44,11 +44,11 @@ fn fewest_chunk_rows(simd: Simd) -> usize {
     common * 48usize.div_ceil(common)
 }
 
-/// Rows of a chunk whose tokens, packed and not, and a slice of whose hidden layer leave room for
+/// WordRows of a chunk whose tokens, packed and not, and a slice of whose hidden layer leave room for
 /// weights in a second-level cache of 2 MB; twice as many are no faster, and spread worse.
 const MOST_CHUNK_ROWS: usize = 192;
 
-/// Rows that take as long as it takes to fetch the weights they are multiplied with.
+/// WordRows that take as long as it takes to fetch the weights they are multiplied with.
 const ROWS_OF_WEIGHTS: usize = 64;
 
 /// When the last thread is done with one layer, in units of a row, if chunks have so many rows.
@@ -101,7 +101,7 @@ fn score(
     simd: Simd,
     shape: &AttentionShape,
     head: usize,
-    queries: Left<'_>,
+    queries: LeftOperand<'_>,
     rows: usize,
     keys: &[u32],
     block: &mut [f32],
@@ -118,7 +118,7 @@ fn score(
             + head * shape.head_keys()
             + panel % per_chunk * panel_len;
         let (right, tail) = keys[at..at + panel_len].split_at(words * columns);
-        let (right, out) = (Panel::whole(right, words), &mut out[panel * columns..]);
+        let (right, out) = (RightPanel::whole(right, words), &mut out[panel * columns..]);
         if shape.scores != Format::Int8 {
             multiply_panel(simd, shape.scores, rows, queries.rows, right, out, stride);
             continue;
@@ -193,13 +193,13 @@ pub fn attend(
         let out = &mut out[first * out_stride..];
         for dim in (0..shape.head_dim).step_by(columns) {
             let segment_rows = shape.mix.words(shape.chunk_rows);
-            let panel = Panel {
+            let panel = RightPanel {
                 data: &values[head * shape.head_values() + dim * segment_rows..],
                 k: shape.mix.words(shape.tokens),
                 segment_rows,
                 segment_stride: shape.values_len(),
             };
-            let weights = Rows::f32(scratch, width);
+            let weights = WordRows::f32(scratch, width);
             multiply_panel(
                 simd,
                 shape.mix,
@@ -305,7 +305,7 @@ fn lay_out(
                 .flat_map(|token| rows[row(token)..][..count].iter().copied())
                 .collect()
         };
-        let place = Place {
+        let place = BlockPosition {
             head,
             dim: 0,
             token: 0,
@@ -323,7 +323,7 @@ fn lay_out(
         }
         for dim in (0..width).step_by(columns) {
             let (place, [query, key, value]) = (
-                Place { dim, ..place },
+                BlockPosition { dim, ..place },
                 rows.map(|rows| block(rows, dim, columns)),
             );
             if shape.scores != Format::Int8 {
@@ -331,7 +331,7 @@ fn lay_out(
                     .pack(simd, shape.scores, filled, columns, (&query, columns))
                     .rows;
                 for (row, words) in query.data.chunks_exact(query.stride).enumerate() {
-                    let at = shape.query_at(Place {
+                    let at = shape.query_at(BlockPosition {
                         token: row,
                         ..place
                     });

@@ -20,7 +20,7 @@
 
 pub mod aligned;
 pub mod attention;
-mod dot;
+mod dispatch;
 pub mod elementwise;
 pub mod gemm;
 #[allow(
@@ -36,6 +36,8 @@ pub mod peak;
     reason = "lanes index several arrays at once"
 )]
 pub mod quantise;
+#[allow(dead_code)]
+mod registers;
 pub mod scan;
 pub mod simd;
 #[allow(
@@ -44,8 +46,6 @@ pub mod simd;
 )]
 pub mod similarity;
 mod testing;
-#[cfg(target_arch = "x86_64")]
-mod tiles;
 mod transpose;
 
 use std::sync::OnceLock;

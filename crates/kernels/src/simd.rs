@@ -7,7 +7,7 @@
 //! is an error, never a quiet step down.
 
 #[cfg(target_arch = "x86_64")]
-use super::tiles;
+use crate::registers::amx;
 use std::fmt;
 use std::str::FromStr;
 use std::sync::OnceLock;
@@ -63,10 +63,7 @@ impl SimdLevel {
             Self::Avx2 => avx2(),
             Self::Avx512 => avx2() && avx512(),
             Self::Amx => {
-                avx2()
-                    && avx512()
-                    && is_x86_feature_detected!("avx512bf16")
-                    && tiles::are_available()
+                avx2() && avx512() && is_x86_feature_detected!("avx512bf16") && amx::is_available()
             }
         }
     }

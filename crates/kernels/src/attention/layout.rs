@@ -12,9 +12,9 @@
 //! end in their factors, `[head][chunk_rows]`.
 
 use crate::Simd;
-use crate::gemm::{Panel, Tiling, multiply_panel};
-use crate::operand::{Format, Left, OperandBuffer, Rows, quantise_into};
-use crate::transpose::transpose;
+use crate::gemm::{RightPanel, Tiling, multiply_panel};
+use crate::operand::{Format, LeftOperand, OperandBuffer, WordRows, quantise_into};
+use crate::transpose::{SourceBlock, transpose};
 
 /// How the tokens of an image and their heads are laid out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -66,7 +66,7 @@ impl AttentionShape {
     }
 
     /// Where in a chunk's queries (`[chunk_rows, query_len]`) a block of their projection begins.
-    pub fn query_at(&self, place: Place) -> usize {
+    pub fn query_at(&self, place: BlockPosition) -> usize {
         place.token * self.query_len()
             + place.head * self.head_words()
             + self.scores.words(place.dim)
@@ -101,7 +101,7 @@ impl AttentionShape {
 
 /// Where a finished block of a projection belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Place {
+pub struct BlockPosition {
     /// The head.
     pub head: usize,
     /// Its dimension that the block's first column is.
@@ -117,20 +117,20 @@ pub struct Place {
 pub fn store_keys(
     simd: Simd,
     shape: &AttentionShape,
-    place: Place,
-    block: Rows<'_>,
+    place: BlockPosition,
+    block: WordRows<'_>,
     keys: &mut [u32],
 ) {
-    let first = shape.scores.words(place.dim) * Tiling::of(simd).columns;
+    let columns = Tiling::of(simd).columns;
+    let first = shape.scores.words(place.dim) * columns;
     for (rows, panel) in key_panels(simd, shape, place, block, keys) {
-        let size = (rows.len() / block.stride, block.stride);
-        transpose(
-            simd,
-            (rows, block.stride),
-            size,
-            &mut panel[first..],
-            Tiling::of(simd).columns,
-        );
+        let source = SourceBlock {
+            words: rows,
+            stride: block.stride,
+            rows: rows.len() / block.stride,
+            columns: block.stride,
+        };
+        transpose(simd, source, &mut panel[first..], columns);
     }
 }
 
@@ -138,8 +138,8 @@ pub fn store_keys(
 fn key_panels<'a>(
     simd: Simd,
     shape: &AttentionShape,
-    place: Place,
-    block: Rows<'a>,
+    place: BlockPosition,
+    block: WordRows<'a>,
     keys: &'a mut [u32],
 ) -> impl Iterator<Item = (&'a [u32], &'a mut [u32])> {
     let columns = Tiling::of(simd).columns;
@@ -160,7 +160,7 @@ fn key_panels<'a>(
 pub fn store_query_codes(
     simd: Simd,
     shape: &AttentionShape,
-    place: Place,
+    place: BlockPosition,
     rows: &[f32],
     queries: &mut [u32],
 ) {
@@ -173,7 +173,7 @@ pub fn store_query_codes(
     let factors = &mut factors[shape.query_factor_at(place.head, place.token) - codes.len()..];
     let factors = bytemuck::cast_slice_mut(&mut factors[..rows.len() / shape.head_dim]);
     let codes = (
-        &mut codes[shape.query_at(Place { dim: 0, ..place })..],
+        &mut codes[shape.query_at(BlockPosition { dim: 0, ..place })..],
         shape.query_len(),
     );
     quantise_into(simd, shape.head_dim, (rows, shape.head_dim), codes, factors);
@@ -186,7 +186,7 @@ pub fn store_query_codes(
 pub fn store_key_codes(
     simd: Simd,
     shape: &AttentionShape,
-    place: Place,
+    place: BlockPosition,
     rows: &[f32],
     buffer: &mut OperandBuffer,
     keys: &mut [u32],
@@ -197,12 +197,18 @@ pub fn store_key_codes(
     let factors = packed.factors.chunks(columns);
     for ((rows, panel), factors) in key_panels(simd, shape, place, packed.rows, keys).zip(factors) {
         let (codes, tail) = panel.split_at_mut(words * columns);
-        transpose(simd, (rows, words), (factors.len(), words), codes, columns);
+        let source = SourceBlock {
+            words: rows,
+            stride: words,
+            rows: factors.len(),
+            columns: words,
+        };
+        transpose(simd, source, codes, columns);
         // From unsigned around 128 to signed.
         codes.iter_mut().for_each(|word| *word ^= ZERO_CODES);
         let (of_columns, offsets) = tail.split_at_mut(columns);
         of_columns[..factors.len()].copy_from_slice(bytemuck::cast_slice(factors));
-        store_offsets(simd, Panel::whole(codes, words), offsets);
+        store_offsets(simd, RightPanel::whole(codes, words), offsets);
     }
 }
 
@@ -213,7 +219,7 @@ const ZERO_CODES: u32 = 0x8080_8080;
 static ZERO_QUERY: [u32; 512] = [ZERO_CODES; 512];
 
 /// What a query of zeros gives, which is what every query's sums are too high by.
-fn store_offsets(simd: Simd, panel: Panel<'_>, offsets: &mut [u32]) {
+fn store_offsets(simd: Simd, panel: RightPanel<'_>, offsets: &mut [u32]) {
     let tile = Tiling::of(simd);
     let mut sums = [0.0; 16 * 32];
     let sums = &mut sums[..tile.row_step * tile.columns];
@@ -221,7 +227,7 @@ fn store_offsets(simd: Simd, panel: Panel<'_>, offsets: &mut [u32]) {
         simd,
         Format::Int8,
         tile.row_step,
-        Rows {
+        WordRows {
             data: &ZERO_QUERY,
             stride: 0,
         },
@@ -239,8 +245,8 @@ fn store_offsets(simd: Simd, panel: Panel<'_>, offsets: &mut [u32]) {
 pub fn store_values(
     simd: Simd,
     shape: &AttentionShape,
-    place: Place,
-    block: Rows<'_>,
+    place: BlockPosition,
+    block: WordRows<'_>,
     values: &mut [u32],
 ) {
     let columns = Tiling::of(simd).columns;
@@ -270,8 +276,8 @@ pub(super) fn head_queries<'a>(
     head: usize,
     first: usize,
     queries: &'a [u32],
-) -> Left<'a> {
-    let at = shape.query_at(Place {
+) -> LeftOperand<'a> {
+    let at = shape.query_at(BlockPosition {
         head,
         dim: 0,
         token: first,
@@ -280,8 +286,8 @@ pub(super) fn head_queries<'a>(
         Format::Int8 => bytemuck::cast_slice(&queries[shape.query_factor_at(head, first)..]),
         _ => &[],
     };
-    Left {
-        rows: Rows {
+    LeftOperand {
+        rows: WordRows {
             data: &queries[at..],
             stride: shape.query_len(),
         },

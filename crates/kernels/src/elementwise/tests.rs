@@ -1,6 +1,8 @@
 //! Epilogues, LayerNorm and softmax against definitions and against each other, at every level.
 
+use super::check::{plain, reference_erf};
 use super::*;
+use crate::gemm::Tiling;
 use crate::testing::ramp;
 use proptest::prelude::*;
 

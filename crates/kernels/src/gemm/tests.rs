@@ -1,5 +1,6 @@
-//! Every level against the portable twin, at odd sizes.
+//! Every level against the scalar reference, at odd sizes.
 
+use super::check::compare_with_plain_sums;
 use super::*;
 use crate::operand::OperandBuffer;
 use crate::testing::ramp;
@@ -50,11 +51,11 @@ proptest! {
             }
             let run = |panel| {
                 let mut out = vec![0.0; tile.rows * tile.columns];
-                multiply_panel(simd, Format::F32, tile.rows, Rows::f32(&left, k), panel, &mut out, tile.columns);
+                multiply_panel(simd, Format::F32, tile.rows, WordRows::f32(&left, k), panel, &mut out, tile.columns);
                 out
             };
-            let panel = Panel { data: &scattered, k, segment_rows, segment_stride };
-            prop_assert_eq!(run(panel), run(Panel::whole(&right, k)));
+            let panel = RightPanel { data: &scattered, k, segment_rows, segment_stride };
+            prop_assert_eq!(run(panel), run(RightPanel::whole(&right, k)));
         }
     }
 }
@@ -68,7 +69,7 @@ fn a_product_over_nothing_is_zero() {
             .filter(|format| format.is_available(simd))
         {
             let mut out = vec![7.0; tile.rows * tile.columns];
-            let left = Rows {
+            let left = WordRows {
                 data: &[],
                 stride: 0,
             };
@@ -77,7 +78,7 @@ fn a_product_over_nothing_is_zero() {
                 format,
                 tile.rows,
                 left,
-                Panel::whole(&[], 0),
+                RightPanel::whole(&[], 0),
                 &mut out,
                 tile.columns,
             );
@@ -95,7 +96,7 @@ fn a_product_over_nothing_is_zero() {
 fn segments_across_each_other_are_refused() {
     let tile = Tiling::of(Simd::SCALAR);
     let data = vec![0; 10 * tile.columns];
-    let panel = Panel {
+    let panel = RightPanel {
         data: &data,
         k: 11,
         segment_rows: 10,
@@ -107,7 +108,7 @@ fn segments_across_each_other_are_refused() {
         Simd::SCALAR,
         Format::F32,
         tile.rows,
-        Rows::f32(&left, 11),
+        WordRows::f32(&left, 11),
         panel,
         &mut out,
         tile.columns,
@@ -118,7 +119,7 @@ fn segments_across_each_other_are_refused() {
 #[should_panic(expected = "panel too short")]
 fn a_short_panel_is_refused() {
     let tile = Tiling::of(Simd::SCALAR);
-    let (left, panel) = (Rows::f32(&[0.0; 64], 8), Panel::whole(&[0; 9], 8));
+    let (left, panel) = (WordRows::f32(&[0.0; 64], 8), RightPanel::whole(&[0; 9], 8));
     multiply_panel(
         Simd::SCALAR,
         Format::F32,
