@@ -20,11 +20,8 @@ pub(super) fn multiply<D: DotIsa, const ROWS: usize, const STEP: usize, const VE
     }
 }
 
-/// Computes the sums of `ROWS` rows from `first` on.
-#[expect(
-    clippy::needless_range_loop,
-    reason = "indices keep the sums in registers; iterators leave them in memory"
-)]
+/// Computes the sums of `ROWS` rows from `first` on. Loops over sums use indices of constant range:
+/// with iterators the compiler leaves the sums in memory.
 #[inline(always)]
 fn multiply_tile<D: DotIsa, const ROWS: usize, const VECTORS: usize>(
     isa: D,

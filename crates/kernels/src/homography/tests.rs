@@ -1,5 +1,6 @@
-//! The kernels of homographies against planted geometry, and every level against the scalar twin.
+//! The kernels of homographies against planted geometry, and every level against the scalar reference.
 
+use super::check::sample_pairs;
 use super::*;
 use proptest::prelude::*;
 
@@ -114,7 +115,7 @@ fn counting_sees_every_correspondence_once_however_many_there_are() {
                 "{n}"
             );
         }
-        let mut xs = pairs.coordinates[0][..n].to_vec();
+        let mut xs = pairs.axis(0)[..n].to_vec();
         xs.sort_by(f32::total_cmp);
         assert!(xs.iter().enumerate().all(|(i, &x)| x == i as f32), "{n}");
     }
@@ -136,7 +137,7 @@ proptest! {
         let pairs = sample_pairs(n, seed);
         let mut samples = [[0; 4]; LANES];
         Sampler::new(seed >> 8).fill(Simd::SCALAR, n, &mut samples);
-        let (bits, twin) = (proper_scalar(&pairs, &samples, 0.1), solve_scalar(&pairs, &samples));
+        let (bits, twin) = (scalar::proper(&pairs, &samples, 0.1), scalar::solve(&pairs, &samples));
         for simd in Simd::all() {
             prop_assert_eq!(proper(simd, &pairs, &samples, 0.1), bits);
             let ours = solve(simd, &pairs, &samples);
@@ -144,7 +145,7 @@ proptest! {
                 prop_assert_eq!(ours.get(lane).map(f32::to_bits), twin.get(lane).map(f32::to_bits));
                 prop_assert_eq!(
                     count_inliers(simd, &pairs, &ours.get(lane), floor),
-                    count_scalar(&pairs, &ours.get(lane), floor)
+                    scalar::count_inliers(&pairs, &ours.get(lane), floor)
                 );
             }
         }
