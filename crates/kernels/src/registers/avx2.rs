@@ -3,6 +3,14 @@
 use super::{Bf16Isa, FloatVector, ROUNDING, VectorIsa, first, first_mut};
 use std::arch::x86_64::*;
 
+/// Whether the CPU has the instructions of this level.
+pub(crate) fn is_available() -> bool {
+    is_x86_feature_detected!("avx2")
+        && is_x86_feature_detected!("fma")
+        && is_x86_feature_detected!("f16c")
+        && is_x86_feature_detected!("popcnt")
+}
+
 /// Proof that the CPU has AVX2, FMA and POPCNT.
 #[derive(Clone, Copy)]
 pub(crate) struct Avx2Isa(());

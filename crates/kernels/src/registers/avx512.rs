@@ -3,6 +3,20 @@
 use super::{Bf16Isa, FloatVector, VectorIsa, first, first_mut};
 use std::arch::x86_64::*;
 
+/// Whether the CPU has the instructions of this level.
+pub(crate) fn is_available() -> bool {
+    is_x86_feature_detected!("avx512f")
+        && is_x86_feature_detected!("avx512bw")
+        && is_x86_feature_detected!("avx512dq")
+        && is_x86_feature_detected!("avx512vl")
+        && is_x86_feature_detected!("avx512vnni")
+}
+
+/// Whether the CPU has AVX-512 BF16, which not every CPU with the rest of AVX-512 has.
+pub(crate) fn has_bf16() -> bool {
+    is_x86_feature_detected!("avx512bf16")
+}
+
 /// Proof that the CPU has AVX-512 F, BW, DQ, VL and VNNI, and POPCNT.
 #[derive(Clone, Copy)]
 pub(crate) struct Avx512Isa(());
@@ -30,15 +44,13 @@ impl Avx512Bf16Isa {
     }
 }
 
-/// Stops unless the CPU has AVX-512 BF16, which not every CPU with the rest of AVX-512 has.
+/// Stops unless the CPU has AVX-512 BF16: callers ask
+/// [`Format::is_available`](crate::operand::Format::is_available) first.
 ///
 /// # Panics
-/// If it lacks them: callers ask [`Format::is_available`](crate::operand::Format) first.
+/// If it lacks them.
 pub(crate) fn require_bf16() {
-    assert!(
-        is_x86_feature_detected!("avx512bf16"),
-        "this CPU has no AVX-512 BF16"
-    );
+    assert!(has_bf16(), "this CPU has no AVX-512 BF16");
 }
 
 /// Sixteen floats. Values are made through [`Avx512Isa`] or from other values only, so each proves
