@@ -35,9 +35,9 @@ impl<T: bytemuck::Pod> AlignedBuffer<T> {
         buffer
     }
 
-    /// Changes the length and keeps the elements that fit. Elements that are added are zero, or what
-    /// they were when the buffer was last that long. Allocates only if the buffer has never been
-    /// this long.
+    /// Changes the length and keeps the elements that fit. Elements that are added are zero, or
+    /// what they were when the buffer was last that long. Allocates only if the buffer has never
+    /// been this long.
     pub fn resize(&mut self, len: usize) {
         let lines = (len * size_of::<T>()).div_ceil(size_of::<CacheLine>());
         if lines > self.lines.len() {

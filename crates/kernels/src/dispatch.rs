@@ -2,7 +2,7 @@
 //!
 //! See the crate's documentation for the convention that this macro relies on.
 
-/// Calls the function of this name in the module `scalar`, `avx2` or `avx512` beside the caller,
+/// Calls the function of this name in the module `scalar`, `avx2` or `avx512` that the caller sees,
 /// whichever the [`Simd`](crate::Simd) token stands for; its value is the function's.
 ///
 /// `dispatch!(simd, kernel(first, second))` is the usual form. CPUs with AMX use the `avx512`

@@ -32,8 +32,8 @@
 //! call `dispatch!(simd, kernel(arguments))`. That macro is the one way from a token to code: it
 //! calls the function `kernel` in the module `scalar`, `avx2`, `avx512` or, if asked for, `amx` of
 //! the folder. In the last three, functions are compiled for their instructions by
-//! `#[target_feature]`. Calling them is unsafe on a CPU that lacks those; the token proves that this
-//! one has them, since [`Simd`] cannot be made for a level that the CPU lacks.
+//! `#[target_feature]`. Calling them is unsafe on a CPU that lacks those; the token proves that
+//! this one has them, since [`Simd`] cannot be made for a level that the CPU lacks.
 //!
 //! Where the algorithm is the same for every instruction set, it is written once as a generic
 //! function over the traits in `registers`, and the four modules call it with their registers.

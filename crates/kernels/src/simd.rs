@@ -83,7 +83,8 @@ impl FromStr for SimdLevel {
 pub enum SimdError {
     /// The environment variable is not the name of a level.
     #[error(
-        "{SIMD_VARIABLE}={value:?} is not a SIMD level; use scalar, avx2, avx512 or amx, or leave it unset"
+        "{SIMD_VARIABLE}={value:?} is not a SIMD level; use scalar, avx2, avx512 or amx, \
+         or leave it unset"
     )]
     UnknownLevel {
         /// Its value.

@@ -211,6 +211,50 @@ impl Reference {
     }
 }
 
+/// Compares one head's results, `out`, and weights of the first row, `first`, with the definition.
+fn compare_head(
+    shape: &AttentionShape,
+    head: usize,
+    reference: &Reference,
+    out: &[f32],
+    first: &[f32],
+) -> Result<(), String> {
+    let AttentionShape {
+        scores,
+        mix,
+        tokens,
+        heads,
+        head_dim,
+        ..
+    } = *shape;
+    // bf16 and int8 keep eight bits: of the scores, then of the weights.
+    let is_exact = scores == Format::F32;
+    let value_tolerance = if is_exact { 1e-5 } else { 2e-2 };
+    let weight_tolerance = if is_exact { 1e-5 } else { 5e-3 };
+    for (row, out) in out.chunks(heads * head_dim).enumerate() {
+        let weights = reference.weights(shape, head, row);
+        for (i, &actual) in out[..head_dim].iter().enumerate() {
+            let expected = reference.mixed(shape, head, &weights, i);
+            if differ(actual, expected, value_tolerance) {
+                return Err(format!(
+                    "{scores:?}, {mix:?}, {tokens} tokens, row {row}: \
+                     {actual} is not {expected}"
+                ));
+            }
+        }
+    }
+
+    let weights = reference.weights(shape, head, 0);
+    let total: f64 = weights.iter().sum();
+    let is_off = |&token: &usize| differ(first[token], weights[token] / total, weight_tolerance);
+    if let Some(token) = (0..tokens).find(is_off) {
+        return Err(format!(
+            "{scores:?}, {mix:?}, {tokens} tokens: weight {token} of the first row is off"
+        ));
+    }
+    Ok(())
+}
+
 /// Compares attention in the given formats (scores, product with the values) with its definition.
 pub(super) fn compare_with_definition(
     simd: Simd,
@@ -236,13 +280,6 @@ pub(super) fn compare_with_definition(
     };
     let sources = [&reference.queries[..], &reference.keys, &reference.values];
     let laid_out = LaidOut::new(simd, &shape, sources);
-    // bf16 and int8 keep eight bits: of the scores, then of the weights.
-    let (value_tolerance, weight_tolerance) = if scores == Format::F32 {
-        (1e-5, 1e-5)
-    } else {
-        (2e-2, 5e-3)
-    };
-
     let rows = Tiling::of(simd).rows * 3 - Tiling::of(simd).row_step;
     let mut scratch = vec![f32::NAN; shape.scratch_len(simd)];
     let mut out = vec![0.0; rows * dim];
@@ -266,28 +303,7 @@ pub(super) fn compare_with_definition(
             dim,
         );
 
-        for row in 0..rows {
-            let weights = reference.weights(&shape, head, row);
-            for i in 0..head_dim {
-                let actual = out[row * dim + i];
-                let expected = reference.mixed(&shape, head, &weights, i);
-                if differ(actual, expected, value_tolerance) {
-                    return Err(format!(
-                        "{scores:?}, {mix:?}, {tokens} tokens, row {row}: {actual} is not {expected}"
-                    ));
-                }
-            }
-        }
-
-        let weights = reference.weights(&shape, head, 0);
-        let total: f64 = weights.iter().sum();
-        let is_off =
-            |&token: &usize| differ(first[token], weights[token] / total, weight_tolerance);
-        if let Some(token) = (0..tokens).find(is_off) {
-            return Err(format!(
-                "{scores:?}, {mix:?}, {tokens} tokens: weight {token} of the first row is off"
-            ));
-        }
+        compare_head(&shape, head, &reference, out, &first)?;
     }
     Ok(())
 }

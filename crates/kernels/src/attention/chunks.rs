@@ -8,7 +8,8 @@ use crate::gemm::Tiling;
 use crate::{Simd, SimdLevel, greatest_common_divisor};
 
 /// Tokens of a chunk, whole register tiles and whole panels of keys, when `images` of `tokens`
-/// tokens each are spread over `threads`. The number changes how long they take, not what they give.
+/// tokens each are spread over `threads`. The number changes how long they take, not what they
+/// give.
 pub fn chunk_rows(simd: Simd, tokens: usize, images: usize, threads: usize) -> usize {
     let fewest = fewest_rows(simd);
     if simd.level() < SimdLevel::Amx {
@@ -29,16 +30,16 @@ pub(super) fn fewest_rows(simd: Simd) -> usize {
     common * 48usize.div_ceil(common)
 }
 
-/// Most rows of a chunk. The tokens of such a chunk, packed and not, and a slice of its hidden layer
-/// leave room for weights in a second-level cache of 2 MB. Twice as many rows are no faster, and
-/// harder to divide among threads.
+/// Most rows of a chunk. The tokens of such a chunk, packed and not, and a slice of its hidden
+/// layer leave room for weights in a second-level cache of 2 MB. Twice as many rows are no faster,
+/// and harder to divide among threads.
 pub(super) const MOST_ROWS: usize = 192;
 
 /// Fetching the weights for a chunk takes as long as multiplying this many rows with them.
 pub(super) const WEIGHT_ROWS: usize = 64;
 
-/// When the last thread has finished one layer if chunks have `rows` rows, in units of the time that
-/// one row takes.
+/// When the last thread has finished one layer if chunks have `rows` rows, in units of the time
+/// that one row takes.
 pub(super) fn finish_time(rows: usize, tokens: usize, images: usize, threads: usize) -> usize {
     let time_of = |rows: usize| if rows == 0 { 0 } else { rows + WEIGHT_ROWS };
     let whole_chunks = images * (tokens / rows);

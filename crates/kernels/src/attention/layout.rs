@@ -112,8 +112,8 @@ pub struct BlockPosition {
     pub head: usize,
     /// The dimension of the head that the block's first column holds.
     pub dim: usize,
-    /// The token within the chunk that the block's first row holds. For keys it must be the first of
-    /// a panel.
+    /// The token within the chunk that the block's first row holds. For keys it must be the first
+    /// of a panel.
     pub token: usize,
 }
 

@@ -3,13 +3,13 @@
 //! Attention multiplies queries with keys, applies softmax to the resulting scores, and multiplies
 //! those weights with values. All scores of an image, `[tokens, tokens]` for each head, would not
 //! fit into a cache. So queries are processed in groups of rows small enough that the scores of a
-//! group, `[group, tokens]`, stay in the second-level cache: a group is multiplied with one panel of
-//! keys after another (2 to 8 kB, which fit into the first-level cache), then softmax runs over its
-//! rows, then it is multiplied with the values.
+//! group, `[group, tokens]`, stay in the second-level cache: a group is multiplied with one panel
+//! of keys after another (2 to 8 kB, which fit into the first-level cache), then softmax runs over
+//! its rows, then it is multiplied with the values.
 //!
-//! Queries are expected to carry the factor log2(e) / sqrt(head_dim), so that softmax can use powers
-//! of two. Scores are products of f32, bf16 or int8; the product with the values is one of f32 or
-//! bf16; softmax is computed in f32.
+//! Queries are expected to carry the factor log2(e) / sqrt(head_dim), so that softmax can use
+//! powers of two. Scores are products of f32, bf16 or int8; the product with the values is one of
+//! f32 or bf16; softmax is computed in f32.
 //!
 //! Everything here is made of the kernels in [`gemm`](crate::gemm) and
 //! [`elementwise`](crate::elementwise), so there is no code for particular instruction sets.

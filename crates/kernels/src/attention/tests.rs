@@ -10,20 +10,30 @@ proptest! {
     fn equals_the_definition(tokens in 36usize..180, heads in 1usize..3) {
         for simd in Simd::all() {
             for formats in check::formats(simd) {
-                prop_assert_eq!(check::compare_with_definition(simd, formats, tokens, heads, 32), Ok(()));
+                prop_assert_eq!(
+                    check::compare_with_definition(simd, formats, tokens, heads, 32),
+                    Ok(())
+                );
             }
         }
     }
 
     #[test]
     fn chunks_are_whole_panels_and_keep_every_thread_busy(
-        tokens in 1usize..3000, images in 1usize..10, threads in 1usize..33
+        tokens in 1usize..3000,
+        images in 1usize..10,
+        threads in 1usize..33,
     ) {
         for simd in Simd::all() {
-            let (tile, rows) = (Tiling::of(simd), chunk_rows(simd, tokens, images, threads));
+            let tile = Tiling::of(simd);
+            let rows = chunk_rows(simd, tokens, images, threads);
             prop_assert_eq!((rows % tile.rows, rows % tile.columns), (0, 0));
             let fewest = chunks::fewest_rows(simd);
-            prop_assert!((fewest..=chunks::MOST_ROWS).contains(&rows), "{} rows", rows);
+            prop_assert!(
+                (fewest..=chunks::MOST_ROWS).contains(&rows),
+                "{} rows",
+                rows
+            );
             if simd.level() == SimdLevel::Amx {
                 let after = |rows| chunks::finish_time(rows, tokens, images, threads);
                 prop_assert!(after(rows) <= after(fewest));

@@ -43,12 +43,14 @@ pub(crate) fn check(simd: Simd) -> Result<(), String> {
 }
 
 fn check_epilogues(simd: Simd) -> Result<(), String> {
-    let (columns, rows) = (Tiling::of(simd).columns, 5);
+    let columns = Tiling::of(simd).columns;
+    let rows = 5;
     let block: Vec<f32> = ramp(rows * columns, 6)
         .iter()
         .map(|value| value * 6.0)
         .collect();
-    let (bias, before) = (ramp(columns, 7), ramp(rows * (columns + 3), 8));
+    let bias = ramp(columns, 7);
+    let before = ramp(rows * (columns + 3), 8);
     for epilogue in Epilogue::ALL {
         let mut out = before.clone();
         finish_block(
@@ -59,7 +61,8 @@ fn check_epilogues(simd: Simd) -> Result<(), String> {
             columns + 3,
         );
         for (index, &actual) in out.iter().enumerate() {
-            let (row, column) = (index / (columns + 3), index % (columns + 3));
+            let row = index / (columns + 3);
+            let column = index % (columns + 3);
             let expected = if column >= columns {
                 f64::from(before[index])
             } else {
@@ -95,15 +98,15 @@ fn check_epilogues(simd: Simd) -> Result<(), String> {
 /// between them must stay.
 fn check_rounded_epilogues(simd: Simd, block: &[f32], rows: usize) -> Result<(), String> {
     let columns = Tiling::of(simd).columns;
-    let (exact_stride, stride, untouched) = (columns + 3, columns / 2 + 3, 7);
+    let exact_stride = columns + 3;
+    let stride = columns / 2 + 3;
+    let untouched = 7;
     for epilogue in Epilogue::ALL
         .into_iter()
         .filter(|&epilogue| epilogue != Epilogue::BiasResidual)
     {
-        let (mut exact, mut rounded) = (
-            vec![0.0; rows * exact_stride],
-            vec![untouched; rows * stride],
-        );
+        let mut exact = vec![0.0; rows * exact_stride];
+        let mut rounded = vec![untouched; rows * stride];
         finish_block(
             simd,
             epilogue,
@@ -120,7 +123,8 @@ fn check_rounded_epilogues(simd: Simd, block: &[f32], rows: usize) -> Result<(),
             stride,
         );
         for (at, &word) in rounded.iter().enumerate() {
-            let (row, column) = (at / stride, 2 * (at % stride));
+            let row = at / stride;
+            let column = 2 * (at % stride);
             let bits = |column: usize| {
                 u32::from(half::bf16::from_f32(exact[row * exact_stride + column]).to_bits())
             };
@@ -131,7 +135,8 @@ fn check_rounded_epilogues(simd: Simd, block: &[f32], rows: usize) -> Result<(),
             };
             if word != expected {
                 return Err(format!(
-                    "{epilogue:?} in bf16 at row {row}, column {column}: {word:x} is not {expected:x}"
+                    "{epilogue:?} in bf16 at row {row}, column {column}: \
+                     {word:x} is not {expected:x}"
                 ));
             }
         }
@@ -154,7 +159,8 @@ pub(super) fn reference_erf(x: f64) -> f64 {
     if x.abs() > 5.0 {
         return x.signum();
     }
-    let (mut term, mut sum) = (x, x);
+    let mut term = x;
+    let mut sum = x;
     for n in 1..120 {
         term *= -x * x / f64::from(n);
         sum += term / f64::from(2 * n + 1);

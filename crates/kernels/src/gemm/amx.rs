@@ -28,29 +28,25 @@ pub(super) fn multiply_f32(job: &mut PanelJob<'_>) {
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni,avx512bf16,popcnt")]
 pub(super) fn multiply_bf16(job: &mut PanelJob<'_>) {
     let vectors = Avx512Bf16Dot(Avx512Bf16Isa::new());
-    multiply_with(bf16_product, vectors, job);
+    multiply_with::<Bf16Product>(vectors, job);
 }
 
 /// See [`super::multiply_panel`].
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni,popcnt")]
 pub(super) fn multiply_int8(job: &mut PanelJob<'_>) {
     let vectors = Avx512Int8Dot(Avx512Isa::new());
-    multiply_with(int8_product, vectors, job);
+    multiply_with::<Int8Product>(vectors, job);
 }
 
 /// Multiplies as much of the sums as fills matrix registers there, the rest in vectors.
 #[inline(always)]
-fn multiply_with(
-    matrix_product: fn(&Registers, PanelJob<'_>),
-    vectors: impl DotIsa,
-    job: &mut PanelJob<'_>,
-) {
+fn multiply_with<P: MatrixProduct>(vectors: impl DotIsa, job: &mut PanelJob<'_>) {
     let whole = whole_steps(job);
     if whole == 0 {
         multiply_in_vectors(vectors, job);
         return;
     }
-    matrix_product(&Registers::configure(), job.shortened(whole));
+    multiply_in_matrices::<P>(&Registers::configure(), job.shortened(whole));
     if whole < job.k() {
         multiply_in_vectors(vectors, &mut job.remainder(whole));
     }
@@ -73,114 +69,183 @@ fn multiply_in_vectors(isa: impl DotIsa, job: &mut PanelJob<'_>) {
     tile::multiply::<_, 8, 8, 2>(isa, job);
 }
 
-/// The product by one instruction, given by its name.
+/// Computes a job of whole steps: its `k` and all its segments are as [`whole_steps`] has them.
+fn multiply_in_matrices<P: MatrixProduct>(registers: &Registers, mut job: PanelJob<'_>) {
+    let mut row = 0;
+    while row < job.rows() {
+        let pair = job.rows() - row >= 2 * ROWS;
+        zero_sums(registers);
+        for (start, segment) in job.segments() {
+            let words = segment.len() / COLUMNS;
+            assert!(
+                words > 0 && words.is_multiple_of(STEP),
+                "segments are whole steps"
+            );
+            let operands = Operands {
+                upper: job.left_from(row)[start..].as_ptr(),
+                left_stride: size_of::<u32>() * job.left_stride(),
+                right: segment.as_ptr(),
+                steps: words / STEP,
+            };
+            if pair {
+                let lower = job.left_from(row + ROWS)[start..].as_ptr();
+                // SAFETY: the segment holds `steps` times sixteen lines, and the left-hand side as
+                // many words from `start` on in each of 32 rows (see `PanelJob`).
+                unsafe { P::add_pair(registers, operands, lower) };
+            } else {
+                // SAFETY: as above, for sixteen rows.
+                unsafe { P::add_single(registers, operands) };
+            }
+        }
+
+        let out_stride = size_of::<u32>() * job.out_stride();
+        let out = job.out_from(row).as_mut_ptr();
+        // SAFETY: the result has 32 words in each of sixteen rows from here on (see `PanelJob`).
+        unsafe { store_upper(registers, out, out_stride) };
+        row += ROWS;
+        if pair {
+            let out = job.out_from(row).as_mut_ptr();
+            // SAFETY: as above, for the other sixteen rows.
+            unsafe { store_lower(registers, out, out_stride) };
+            row += ROWS;
+        }
+    }
+}
+
+/// Columns of a panel.
+const COLUMNS: usize = 32;
+
+/// Bytes from one line of a panel to the next.
+const LINE: usize = size_of::<u32>() * COLUMNS;
+
+/// What the matrix instructions read: sixteen rows of the left-hand side, whose starts are
+/// `left_stride` bytes apart, and the lines of a panel, for `steps` (not zero) steps.
+struct Operands {
+    upper: *const u32,
+    left_stride: usize,
+    right: *const u32,
+    steps: usize,
+}
+
+/// The product of one format. The configured registers prove that the CPU has the instruction.
+trait MatrixProduct {
+    /// Adds the products of sixteen rows to the upper sums.
+    ///
+    /// # Safety
+    /// The pointers must be valid for what `operands` says, sixteen words a step in each row and
+    /// sixteen lines of [`COLUMNS`] words a step.
+    unsafe fn add_single(registers: &Registers, operands: Operands);
+
+    /// Adds the products of sixteen rows to the upper sums, and those of the sixteen rows from
+    /// `lower` on to the lower sums.
+    ///
+    /// # Safety
+    /// As [`add_single`](Self::add_single), and the same for `lower`.
+    unsafe fn add_pair(registers: &Registers, operands: Operands, lower: *const u32);
+}
+
+/// Implements [`MatrixProduct`] by one instruction, given by its name.
 macro_rules! matrix_product {
     ($name:ident, $instruction:literal) => {
-        /// The job's `k` and all its segments must be whole steps long, as [`whole_steps`] has it.
-        fn $name(registers: &Registers, mut job: PanelJob<'_>) {
-            // Strides in bytes, and those of the lines of a panel of 32 columns.
-            let left_stride = 4 * job.left_stride();
-            let out_stride = 4 * job.out_stride();
-            let line = 128usize;
+        struct $name;
 
-            let mut row = 0;
-            while row < job.rows() {
-                let pair = job.rows() - row >= 2 * ROWS;
-                zero_sums(registers);
-                for (start, segment) in job.segments() {
-                    assert!(segment.len().is_multiple_of(STEP * 32));
-                    let steps = segment.len() / (STEP * 32);
-                    let upper = job.left_from(row)[start..].as_ptr();
-                    let right = segment.as_ptr();
-                    if pair {
-                        let lower = job.left_from(row + ROWS)[start..].as_ptr();
-                        // SAFETY: reads `steps` times sixteen words of 32 rows of the left-hand
-                        // side, which has that many rows and words left in each (see `PanelJob`),
-                        // and as many lines of the segment. `steps` is not zero, since segments are
-                        // not empty. `Registers` proves that the registers are configured.
-                        unsafe {
-                            asm!(
-                                "2:",
-                                "tileloadd tmm4, [{upper} + {stride}*1]",
-                                "tileloadd tmm6, [{right} + {line}*1]",
-                                concat!($instruction, " tmm0, tmm4, tmm6"),
-                                "tileloadd tmm7, [{right} + {line}*1 + 64]",
-                                concat!($instruction, " tmm1, tmm4, tmm7"),
-                                "tileloadd tmm5, [{lower} + {stride}*1]",
-                                concat!($instruction, " tmm2, tmm5, tmm6"),
-                                concat!($instruction, " tmm3, tmm5, tmm7"),
-                                "add {upper}, 64",
-                                "add {lower}, 64",
-                                "add {right}, 2048",
-                                "dec {steps}",
-                                "jnz 2b",
-                                upper = inout(reg) upper => _,
-                                lower = inout(reg) lower => _,
-                                right = inout(reg) right => _,
-                                steps = inout(reg) steps => _,
-                                stride = in(reg) left_stride,
-                                line = in(reg) line,
-                                options(nostack, readonly),
-                            );
-                        }
-                    } else {
-                        // SAFETY: as above, for sixteen rows of the left-hand side.
-                        unsafe {
-                            asm!(
-                                "2:",
-                                "tileloadd tmm6, [{right} + {line}*1]",
-                                "tileloadd tmm7, [{right} + {line}*1 + 64]",
-                                "tileloadd tmm4, [{upper} + {stride}*1]",
-                                concat!($instruction, " tmm0, tmm4, tmm6"),
-                                concat!($instruction, " tmm1, tmm4, tmm7"),
-                                "add {upper}, 64",
-                                "add {right}, 2048",
-                                "dec {steps}",
-                                "jnz 2b",
-                                upper = inout(reg) upper => _,
-                                right = inout(reg) right => _,
-                                steps = inout(reg) steps => _,
-                                stride = in(reg) left_stride,
-                                line = in(reg) line,
-                                options(nostack, readonly),
-                            );
-                        }
-                    }
-                }
-
-                let out = job.out_from(row).as_mut_ptr();
-                // SAFETY: writes 32 words of sixteen rows, which the result has (see `PanelJob`).
+        impl MatrixProduct for $name {
+            #[inline(always)]
+            unsafe fn add_single(_: &Registers, operands: Operands) {
+                // SAFETY: reads only what the caller guarantees, through configured registers.
                 unsafe {
                     asm!(
-                        "tilestored [{out} + {stride}*1], tmm0",
-                        "tilestored [{out} + {stride}*1 + 64], tmm1",
-                        out = in(reg) out,
-                        stride = in(reg) out_stride,
-                        options(nostack, preserves_flags),
+                        "2:",
+                        "tileloadd tmm6, [{right} + {line}*1]",
+                        "tileloadd tmm7, [{right} + {line}*1 + 64]",
+                        "tileloadd tmm4, [{upper} + {stride}*1]",
+                        concat!($instruction, " tmm0, tmm4, tmm6"),
+                        concat!($instruction, " tmm1, tmm4, tmm7"),
+                        "add {upper}, 64",
+                        "add {right}, 2048",
+                        "dec {steps}",
+                        "jnz 2b",
+                        upper = inout(reg) operands.upper => _,
+                        right = inout(reg) operands.right => _,
+                        steps = inout(reg) operands.steps => _,
+                        stride = in(reg) operands.left_stride,
+                        line = in(reg) LINE,
+                        options(nostack, readonly),
                     );
                 }
-                row += ROWS;
-                if pair {
-                    let out = job.out_from(row).as_mut_ptr();
-                    // SAFETY: as above, for the other sixteen rows.
-                    unsafe {
-                        asm!(
-                            "tilestored [{out} + {stride}*1], tmm2",
-                            "tilestored [{out} + {stride}*1 + 64], tmm3",
-                            out = in(reg) out,
-                            stride = in(reg) out_stride,
-                            options(nostack, preserves_flags),
-                        );
-                    }
-                    row += ROWS;
+            }
+
+            #[inline(always)]
+            unsafe fn add_pair(_: &Registers, operands: Operands, lower: *const u32) {
+                // SAFETY: reads only what the caller guarantees, through configured registers.
+                unsafe {
+                    asm!(
+                        "2:",
+                        "tileloadd tmm4, [{upper} + {stride}*1]",
+                        "tileloadd tmm6, [{right} + {line}*1]",
+                        concat!($instruction, " tmm0, tmm4, tmm6"),
+                        "tileloadd tmm7, [{right} + {line}*1 + 64]",
+                        concat!($instruction, " tmm1, tmm4, tmm7"),
+                        "tileloadd tmm5, [{lower} + {stride}*1]",
+                        concat!($instruction, " tmm2, tmm5, tmm6"),
+                        concat!($instruction, " tmm3, tmm5, tmm7"),
+                        "add {upper}, 64",
+                        "add {lower}, 64",
+                        "add {right}, 2048",
+                        "dec {steps}",
+                        "jnz 2b",
+                        upper = inout(reg) operands.upper => _,
+                        lower = inout(reg) lower => _,
+                        right = inout(reg) operands.right => _,
+                        steps = inout(reg) operands.steps => _,
+                        stride = in(reg) operands.left_stride,
+                        line = in(reg) LINE,
+                        options(nostack, readonly),
+                    );
                 }
             }
         }
     };
 }
 
-matrix_product!(bf16_product, "tdpbf16ps");
-matrix_product!(int8_product, "tdpbusd");
+matrix_product!(Bf16Product, "tdpbf16ps");
+matrix_product!(Int8Product, "tdpbusd");
+
+/// Writes the upper sums to sixteen rows of [`COLUMNS`] words, `stride` bytes apart.
+///
+/// # Safety
+/// `out` must be valid for writing that much.
+#[inline(always)]
+unsafe fn store_upper(_: &Registers, out: *mut u32, stride: usize) {
+    // SAFETY: writes only what the caller guarantees, from configured registers.
+    unsafe {
+        asm!(
+            "tilestored [{out} + {stride}*1], tmm0",
+            "tilestored [{out} + {stride}*1 + 64], tmm1",
+            out = in(reg) out,
+            stride = in(reg) stride,
+            options(nostack, preserves_flags),
+        );
+    }
+}
+
+/// As [`store_upper`], for the lower sums.
+///
+/// # Safety
+/// As [`store_upper`].
+#[inline(always)]
+unsafe fn store_lower(_: &Registers, out: *mut u32, stride: usize) {
+    // SAFETY: writes only what the caller guarantees, from configured registers.
+    unsafe {
+        asm!(
+            "tilestored [{out} + {stride}*1], tmm2",
+            "tilestored [{out} + {stride}*1 + 64], tmm3",
+            out = in(reg) out,
+            stride = in(reg) stride,
+            options(nostack, preserves_flags),
+        );
+    }
+}
 
 /// Zeroes the four registers of sums.
 #[inline(always)]

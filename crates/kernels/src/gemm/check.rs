@@ -19,8 +19,8 @@ pub(crate) fn check(simd: Simd) -> Result<(), String> {
     Ok(())
 }
 
-/// Multiplies as the transformer does, slice by slice through the epilogue, and compares with f64
-/// sums over what both sides hold.
+/// Multiplies as the transformer does, slice by slice through the epilogue, and compares the result
+/// with sums in f64. Rows of the left-hand side are `tiles` tiles and a step.
 pub(super) fn compare_with_plain_sums(
     simd: Simd,
     format: Format,
@@ -33,10 +33,8 @@ pub(super) fn compare_with_plain_sums(
     let rows = tiles * tile.rows + tile.row_step;
     let left = ramp(rows * stride, 1);
     let right = ramp(k * n, 2);
-    let matrix = PackedMatrix::pack(simd, format, (k, n), slice, |row, column| {
-        right[row * n + column]
-    });
-    let bias = vec![0.25; tile.columns];
+    let element = |row: usize, column: usize| right[row * n + column];
+    let matrix = PackedMatrix::pack(simd, format, (k, n), slice, element);
     // A code is off by up to half a step. Errors have either sign, so over a sum of k products they
     // grow with the square root of k.
     let tolerance = match format {
@@ -44,54 +42,65 @@ pub(super) fn compare_with_plain_sums(
         Format::Bf16 => 4e-3 * (k as f64).sqrt() + 1e-3,
         Format::Int8 => 1e-2 * (k as f64).sqrt() + 1e-3,
     };
+
     for panel in 0..matrix.panels() {
-        let mut out = vec![0.5f32; rows * tile.columns];
-        for (index, from) in (0..k).step_by(slice).enumerate() {
-            let mut buffer = OperandBuffer::default();
-            let width = slice.min(k - from);
-            let packed = buffer.pack(simd, format, rows, width, (&left[from..], stride));
-            let mut block = vec![f32::NAN; rows * tile.columns];
-            multiply_panel(
-                simd,
-                format,
-                rows,
-                packed.rows,
-                matrix.panel(panel, index),
-                &mut block,
-                tile.columns,
-            );
-            let bias = if index == 0 { Some(&bias[..]) } else { None };
-            let product = Product {
-                rows,
-                block: &block,
-                codes: matrix.codes(panel, index),
-                factors: packed.factors,
-                bias,
-            };
-            finish_block(
-                simd,
-                Epilogue::BiasResidual,
-                product,
-                &mut out,
-                tile.columns,
-            );
-        }
+        let out = multiply_by_slices(simd, &matrix, panel, slice, (&left, stride, k), rows);
         for (at, &actual) in out.iter().enumerate() {
-            let (row, column) = (at / tile.columns, panel * tile.columns + at % tile.columns);
-            let term =
-                |i: usize| f64::from(left[row * stride + i]) * f64::from(right[i * n + column]);
-            let expected = 0.75
-                + if column < n {
-                    (0..k).map(term).sum::<f64>()
-                } else {
-                    0.0
-                };
+            let row = at / tile.columns;
+            let column = panel * tile.columns + at % tile.columns;
+            let mut expected = START + f64::from(BIAS);
+            if column < n {
+                let row = left[row * stride..][..k].iter();
+                let products = row
+                    .enumerate()
+                    .map(|(i, &value)| f64::from(value) * f64::from(right[i * n + column]));
+                expected += products.sum::<f64>();
+            }
             if differ(actual, expected, tolerance) {
                 return Err(format!(
-                    "{format:?}, k {k}, n {n}, row {row}, column {column}: {actual} is not {expected}"
+                    "{format:?}, k {k}, n {n}, row {row}, column {column}: \
+                     {actual} is not {expected}"
                 ));
             }
         }
     }
     Ok(())
+}
+
+/// What the result holds before the product is added.
+const START: f64 = 0.5;
+
+/// What is added to every column.
+const BIAS: f32 = 0.25;
+
+/// `START + BIAS + left * panel`, `[rows, columns]`, where `left` is `(values, stride, k)`.
+fn multiply_by_slices(
+    simd: Simd,
+    matrix: &PackedMatrix,
+    panel: usize,
+    slice: usize,
+    (left, stride, k): (&[f32], usize, usize),
+    rows: usize,
+) -> Vec<f32> {
+    let columns = Tiling::of(simd).columns;
+    let format = matrix.format();
+    let bias = vec![BIAS; columns];
+    let mut out = vec![START as f32; rows * columns];
+    for (index, from) in (0..k).step_by(slice).enumerate() {
+        let mut buffer = OperandBuffer::default();
+        let width = slice.min(k - from);
+        let packed = buffer.pack(simd, format, rows, width, (&left[from..], stride));
+        let mut block = vec![f32::NAN; rows * columns];
+        let right = matrix.panel(panel, index);
+        multiply_panel(simd, format, rows, packed.rows, right, &mut block, columns);
+        let product = Product {
+            rows,
+            block: &block,
+            codes: matrix.codes(panel, index),
+            factors: packed.factors,
+            bias: if index == 0 { Some(&bias) } else { None },
+        };
+        finish_block(simd, Epilogue::BiasResidual, product, &mut out, columns);
+    }
+    out
 }

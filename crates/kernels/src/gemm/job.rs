@@ -64,11 +64,13 @@ impl<'a> PanelJob<'a> {
     }
 
     /// Length of the sums in words.
+    #[cfg(target_arch = "x86_64")]
     pub(super) fn k(&self) -> usize {
         self.right.k
     }
 
     /// Rows of a segment of the panel.
+    #[cfg(target_arch = "x86_64")]
     pub(super) fn segment_rows(&self) -> usize {
         self.right.segment_rows
     }
@@ -120,6 +122,7 @@ impl<'a> PanelJob<'a> {
     }
 
     /// The same product over the first `k` words only.
+    #[cfg(target_arch = "x86_64")]
     pub(super) fn shortened(&mut self, k: usize) -> PanelJob<'_> {
         assert!(k <= self.right.k);
         PanelJob {
@@ -131,6 +134,7 @@ impl<'a> PanelJob<'a> {
 
     /// What is left of the product after its first `k` words, which must end in the last segment of
     /// the panel; its sums are added to the result.
+    #[cfg(target_arch = "x86_64")]
     pub(super) fn remainder(&mut self, k: usize) -> PanelJob<'_> {
         let RightPanel {
             segment_rows,

@@ -132,9 +132,10 @@ impl MatrixUnitGuard {
     }
 }
 
-/// Multiplies `rows` rows (a multiple of [`Tiling::row_step`]) of `left`, `[rows, k]`, with a panel,
-/// `[k, columns]`, both in `format`. Row `i` of the result is the first [`Tiling::columns`] elements
-/// at `out[i * out_stride]`. For int8 the elements are the bits of i32 sums of products of codes.
+/// Multiplies `rows` rows (a multiple of [`Tiling::row_step`]) of `left`, `[rows, k]`, with a
+/// panel, `[k, columns]`, both in `format`. Row `i` of the result is the first [`Tiling::columns`]
+/// elements at `out[i * out_stride]`. For int8 the elements are the bits of i32 sums of products of
+/// codes.
 ///
 /// # Panics
 /// If a slice is too short for what it is said to hold, or the format is bf16 at

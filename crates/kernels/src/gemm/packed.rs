@@ -18,8 +18,8 @@ pub struct PanelCodes<'a> {
 
 /// A `[k, n]` matrix cut into panels, `[panels][k in words][columns]`. Columns beyond n are zero.
 ///
-/// For int8 products, k may be cut into slices that are multiplied one at a time: the left-hand side
-/// then has a factor for each row and slice, which is more exact.
+/// For int8 products, k may be cut into slices that are multiplied one at a time: the left-hand
+/// side then has a factor for each row and slice, which is more exact.
 #[derive(Debug, Clone)]
 pub struct PackedMatrix {
     format: Format,
@@ -30,7 +30,8 @@ pub struct PackedMatrix {
     columns: usize,
     /// Rows of k in a slice.
     slice: usize,
-    /// `[panels * columns]`: value of one code unit of each column; empty unless the format is int8.
+    /// `[panels * columns]`: value of one code unit of each column; empty unless the format is
+    /// int8.
     factors: Vec<f32>,
     /// `[slices][panels * columns]`: see [`PanelCodes::offsets`]; empty unless the format is int8.
     offsets: Vec<i32>,
@@ -120,7 +121,8 @@ impl PackedMatrix {
         self.n
     }
 
-    /// Number of panels; the last one may have fewer than [`Tiling::columns`] columns of the matrix.
+    /// Number of panels; the last one may have fewer than [`Tiling::columns`] columns of the
+    /// matrix.
     pub fn panels(&self) -> usize {
         self.n.div_ceil(self.columns)
     }
@@ -171,8 +173,8 @@ impl ColumnCodes {
     }
 
     fn code(&self, value: f32) -> i8 {
-        // Rounds to the nearest integer. `round_ties_even` gives the same, but without SSE4.1, which
-        // a build for every x86-64 CPU cannot assume, it is a function call for each weight.
+        // Rounds to the nearest integer. `round_ties_even` gives the same, but without SSE4.1,
+        // which a build for every x86-64 CPU cannot assume, it is a function call for each weight.
         (value / self.largest * 127.0 + ROUNDING - ROUNDING) as i8
     }
 }

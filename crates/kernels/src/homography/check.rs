@@ -8,8 +8,8 @@ use crate::Simd;
 pub(crate) fn check(simd: Simd) -> Result<(), String> {
     for (n, seed) in [(4, 1), (5, 2), (37, 3), (131, 4)] {
         let pairs = sample_pairs(n, seed);
-        let mut twin = OneByOne::new(seed);
-        let expected: [Sample; LANES] = std::array::from_fn(|_| twin.next(n));
+        let mut reference = OneByOne::new(seed);
+        let expected: [Sample; LANES] = std::array::from_fn(|_| reference.next(n));
         let mut samples = [[0; 4]; LANES];
         Sampler::new(seed).fill(simd, n, &mut samples);
         if samples != expected {
@@ -19,22 +19,23 @@ pub(crate) fn check(simd: Simd) -> Result<(), String> {
         let are_proper = scalar::proper(&pairs, &samples, 1e-3);
         if ours != are_proper {
             return Err(format!(
-                "which samples of {n} correspondences are proper: {ours:b} instead of {are_proper:b}"
+                "which samples of {n} correspondences are proper: \
+                 {ours:b} instead of {are_proper:b}"
             ));
         }
         let ours = solve(simd, &pairs, &samples);
-        let twin = scalar::solve(&pairs, &samples);
+        let reference = scalar::solve(&pairs, &samples);
         for lane in (0..LANES).filter(|lane| are_proper >> lane & 1 == 1) {
-            if ours.get(lane).map(f32::to_bits) != twin.get(lane).map(f32::to_bits) {
+            if ours.get(lane).map(f32::to_bits) != reference.get(lane).map(f32::to_bits) {
                 return Err(format!("four-point solutions among {n} correspondences"));
             }
             for floor in [0, n / 2, n] {
-                let homography = twin.get(lane);
+                let homography = reference.get(lane);
                 let ours = count_inliers(simd, &pairs, &homography, floor);
-                let twin = scalar::count_inliers(&pairs, &homography, floor);
-                if ours != twin {
+                let reference = scalar::count_inliers(&pairs, &homography, floor);
+                if ours != reference {
                     return Err(format!(
-                        "{ours} instead of {twin} inliers among {n} correspondences"
+                        "{ours} instead of {reference} inliers among {n} correspondences"
                     ));
                 }
             }
@@ -54,7 +55,8 @@ pub(super) fn sample_pairs(n: usize, seed: u64) -> PointPairs {
     };
     let mut pairs = PointPairs::default();
     pairs.fill((0..n).map(|i| {
-        let (x, y) = (next() as f32 / 2.0, next() as f32 / 2.0);
+        let x = next() as f32 / 2.0;
+        let y = next() as f32 / 2.0;
         if i % 2 == 0 {
             [x, y, x + 1.25, y * 1.1 - 2.0]
         } else {

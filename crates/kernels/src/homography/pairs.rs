@@ -64,7 +64,8 @@ impl PointPairs {
 }
 
 /// A step with which a walk around `len` positions visits each once, and successive visits are far
-/// apart: the largest up to about the golden section of `len` that has no divisor in common with it.
+/// apart: the largest up to about the golden section of `len` that has no divisor in common with
+/// it.
 fn spreading_stride(len: usize) -> usize {
     let mut strides = (1..=len * 5 / 8).rev();
     let coprime = |stride: &usize| greatest_common_divisor(*stride, len) == 1;

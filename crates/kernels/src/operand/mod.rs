@@ -28,9 +28,9 @@ pub enum Format {
     F32,
     /// Two bfloat16, rounded to the nearest, the earlier in the low half.
     Bf16,
-    /// Four 8-bit integers, the earliest in the lowest byte. On the left they are unsigned and stand
-    /// for `(code - 128) * factor` with a factor for each row; on the right they are signed and
-    /// stand for `code * factor` with a factor for each column.
+    /// Four 8-bit integers, the earliest in the lowest byte. On the left they are unsigned and
+    /// stand for `(code - 128) * factor` with a factor for each row; on the right they are signed
+    /// and stand for `code * factor` with a factor for each column.
     Int8,
 }
 
@@ -191,10 +191,10 @@ impl OperandBuffer {
     }
 }
 
-/// Quantises rows of `width` f32 to the unsigned codes of a left-hand side ([`Format::Int8`]). There
-/// are as many rows as `factors`, `[rows]`, which receive the value of one code unit of each. Row
-/// `i` is read from `i * stride` of `source = (values, stride)` and written from `i * out_stride` of
-/// `(out, out_stride)` on.
+/// Quantises rows of `width` f32 to the unsigned codes of a left-hand side ([`Format::Int8`]).
+/// There are as many rows as `factors`, `[rows]`, which receive the value of one code unit of each.
+/// Row `i` is read from `i * stride` of `source = (values, stride)` and written from `i *
+/// out_stride` of `(out, out_stride)` on.
 ///
 /// # Panics
 /// If a slice is too short, or `width` is not a multiple of [`width_step`].

@@ -22,11 +22,22 @@ fn unpack(format: Format, left: LeftOperand<'_>, rows: usize, width: usize) -> V
 
 proptest! {
     #[test]
-    fn packing_keeps_values_within_the_formats_step(rows in 1usize..5, steps in 1usize..9, scale in 1e-3f32..1e3) {
-        let (width, stride) = (steps * 16, steps * 16 + 5);
-        let source: Vec<f32> = ramp(rows * stride, 3).iter().map(|value| value * scale).collect();
+    fn packing_keeps_values_within_the_formats_step(
+        rows in 1usize..5,
+        steps in 1usize..9,
+        scale in 1e-3f32..1e3,
+    ) {
+        let width = steps * 16;
+        let stride = steps * 16 + 5;
+        let source: Vec<f32> = ramp(rows * stride, 3)
+            .iter()
+            .map(|value| value * scale)
+            .collect();
         for simd in Simd::all() {
-            for format in Format::ALL.into_iter().filter(|format| format.is_available(simd)) {
+            for format in Format::ALL
+                .into_iter()
+                .filter(|format| format.is_available(simd))
+            {
                 let mut buffer = OperandBuffer::default();
                 let left = buffer.pack(simd, format, rows, width, (&source, stride));
                 for (at, actual) in unpack(format, left, rows, width).into_iter().enumerate() {
@@ -36,7 +47,10 @@ proptest! {
                         Format::Bf16 => expected.abs() / 256.0,
                         Format::Int8 => scale / 253.0,
                     };
-                    prop_assert!((actual - expected).abs() <= step, "{format:?}: {actual} for {expected}");
+                    prop_assert!(
+                        (actual - expected).abs() <= step,
+                        "{format:?}: {actual} for {expected}"
+                    );
                 }
             }
         }
@@ -45,17 +59,34 @@ proptest! {
 
 proptest! {
     #[test]
-    fn codes_are_those_of_what_the_channels_make_of_a_value(rows in 1usize..4, steps in 1usize..5, seed in 0u32..99) {
+    fn codes_are_those_of_what_the_channels_make_of_a_value(
+        rows in 1usize..4,
+        steps in 1usize..5,
+        seed in 0u32..99,
+    ) {
         let width = steps * 16;
-        let (source, gain, shift) = (ramp(rows * width, seed), ramp(width, seed + 1), ramp(width, seed + 2));
-        let scaled: Vec<f32> =
-            source.iter().enumerate().map(|(at, value)| value * gain[at % width] + shift[at % width]).collect();
+        let source = ramp(rows * width, seed);
+        let gain = ramp(width, seed + 1);
+        let shift = ramp(width, seed + 2);
+        let scaled: Vec<f32> = source
+            .iter()
+            .enumerate()
+            .map(|(at, value)| value * gain[at % width] + shift[at % width])
+            .collect();
         for simd in Simd::all() {
-            let (mut ours, mut plain) = (OperandBuffer::default(), OperandBuffer::default());
-            let channels = ChannelScaling { gain: &gain, shift: &shift };
-            let ours = ours.pack_scaled(simd, Format::Int8, rows, width, (&source, width), channels);
+            let mut ours = OperandBuffer::default();
+            let mut plain = OperandBuffer::default();
+            let channels = ChannelScaling {
+                gain: &gain,
+                shift: &shift,
+            };
+            let ours =
+                ours.pack_scaled(simd, Format::Int8, rows, width, (&source, width), channels);
             let plain = plain.pack(simd, Format::Int8, rows, width, (&scaled, width));
-            prop_assert_eq!((ours.rows.data, ours.factors), (plain.rows.data, plain.factors));
+            prop_assert_eq!(
+                (ours.rows.data, ours.factors),
+                (plain.rows.data, plain.factors)
+            );
         }
     }
 }

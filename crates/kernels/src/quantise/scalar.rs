@@ -41,7 +41,8 @@ pub(super) fn quantise(values: &[f32], divisor: f32, factor: f32, codes: &mut [i
         // A plain cast would saturate, which the compiler does one element at a time.
         // SAFETY: `scaled` is a number within -127..=127, which i32 can hold.
         let whole: i32 = unsafe { scaled.to_int_unchecked() };
-        // The difference is exact, so that a half is told from its neighbouring floats.
+        // The difference is exact, so that exactly one half is distinguished from its neighbouring
+        // floats.
         let fraction = scaled - whole as f32;
         let rounded = whole + i32::from(fraction >= 0.5) - i32::from(fraction <= -0.5);
         *code = rounded as i8;

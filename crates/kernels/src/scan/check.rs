@@ -24,7 +24,8 @@ pub(crate) fn check(simd: Simd) -> Result<(), String> {
     rows.extend(extreme);
     for (number, query) in rows.iter().enumerate() {
         for count in [0, 1, 3, 4, 7, rows.len()] {
-            let (mut expected, mut found) = (vec![0; count], vec![0; count]);
+            let mut expected = vec![0; count];
+            let mut found = vec![0; count];
             scalar::dot_products(query, &rows[..count], &mut expected);
             dot_products(simd, query, &rows[..count], &mut found);
             if expected != found {
@@ -45,7 +46,9 @@ fn check_near(simd: Simd, codes: &[Codes]) -> Result<(), String> {
             .map(|row| (row % 7 + 1) as f32 * scale)
             .collect()
     };
-    let (scales, errors, squares) = (column(1e-3), column(1e-2), column(0.5));
+    let scales = column(1e-3);
+    let errors = column(1e-2);
+    let squares = column(0.5);
     let rows = ScanRows {
         codes: &codes,
         scales: &scales,
@@ -65,15 +68,17 @@ fn check_near(simd: Simd, codes: &[Codes]) -> Result<(), String> {
         for threshold in [f32::NEG_INFINITY, -20.0, -2.0, 0.5, f32::INFINITY, f32::NAN] {
             let mut from = Some(0);
             while let Some(start) = from {
-                let (mut expected, mut found) = (Bounds::NONE, Bounds::NONE);
-                let twin = scalar::next_near(&query, &rows, start, threshold, &mut expected);
+                let mut expected = Bounds::NONE;
+                let mut found = Bounds::NONE;
+                let reference = scalar::next_near(&query, &rows, start, threshold, &mut expected);
                 let ours = next_near(simd, &query, &rows, start, threshold, &mut found);
-                if ours != twin || twin.is_some() && expected != found {
+                if ours != reference || reference.is_some() && expected != found {
                     return Err(format!(
-                        "the group near from row {start} on: {ours:?} {found:?} is not {twin:?} {expected:?}"
+                        "the group near from row {start} on: {ours:?} {found:?} \
+                         is not {reference:?} {expected:?}"
                     ));
                 }
-                from = twin.map(|group| group + GROUP);
+                from = reference.map(|group| group + GROUP);
             }
         }
     }

@@ -79,10 +79,8 @@ pub(crate) fn check(simd: Simd) -> Result<(), String> {
         (384, [17, 3, 9], [6, 12, 25]),
     ];
     for (seed, (dim, rows, columns)) in shapes.into_iter().enumerate() {
-        let (r, c) = (
-            RandomDescriptors::new(dim, rows, seed as u64),
-            RandomDescriptors::new(dim, columns, seed as u64 + 99),
-        );
+        let r = RandomDescriptors::new(dim, rows, seed as u64);
+        let c = RandomDescriptors::new(dim, columns, seed as u64 + 99);
         let ours = maxima_at(simd, c.quantised(dim), r.quantised(dim), &wanted);
         if ours != maxima_at(Simd::SCALAR, c.quantised(dim), r.quantised(dim), &wanted) {
             return Err(format!(

@@ -8,6 +8,7 @@ use crate::Simd;
 use crate::dispatch::dispatch;
 
 /// 64 bytes on a cache line of their own.
+#[cfg(target_arch = "x86_64")]
 #[derive(Debug, Clone, Copy)]
 #[repr(C, align(64))]
 pub(super) struct CacheLine<T: Copy, const N: usize>(pub(super) [T; N]);
@@ -22,9 +23,11 @@ pub struct PackedColumns {
     pub(super) codes: Vec<i8>,
     /// AVX2: `[panels][dim / 2]`; a panel is 16 columns wide, and a line holds two successive
     /// values of each column.
+    #[cfg(target_arch = "x86_64")]
     pub(super) pairs: Vec<CacheLine<i16, 32>>,
     /// AVX-512: `[panels][dim / 4]`; a panel is 32 columns wide, and two lines hold four successive
     /// values of each column, increased by 128.
+    #[cfg(target_arch = "x86_64")]
     pub(super) quads: Vec<[CacheLine<u8, 64>; 2]>,
     /// One for each column; sections are filled up to whole panels with NaN, which never wins a
     /// comparison.
@@ -39,7 +42,9 @@ impl PackedColumns {
             dim: 1,
             counts: [0; SECTIONS],
             codes: Vec::new(),
+            #[cfg(target_arch = "x86_64")]
             pairs: Vec::new(),
+            #[cfg(target_arch = "x86_64")]
             quads: Vec::new(),
             factors: Vec::new(),
         }

@@ -63,8 +63,8 @@ pub(super) struct LaneBests<I: SimilarityIsa> {
     pub(super) indices: I::Integers,
 }
 
-/// See [`super::block_maxima`], which has checked the lengths. Tiles are `TILE` rows high, or `STEP`
-/// if fewer are left.
+/// See [`super::block_maxima`], which has checked the lengths. Tiles are `TILE` rows high, or
+/// `STEP` if fewer are left.
 #[expect(
     clippy::needless_range_loop,
     reason = "a section indexes several arrays"

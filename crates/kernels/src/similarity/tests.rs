@@ -35,7 +35,8 @@ fn plain(
     let mut best_row = vec![[u32::MAX; 3]; columns.len()];
     for r in 0..rows.len() {
         for c in 0..columns.len() {
-            let (rs, cs) = (section_of(&rows, r), section_of(&columns, c));
+            let rs = section_of(&rows, r);
+            let cs = section_of(&columns, c);
             if !wanted[rs][cs] {
                 continue;
             }
@@ -53,12 +54,10 @@ fn plain(
 }
 
 #[test]
-fn scalar_twin_follows_the_definition() {
+fn scalar_reference_follows_the_definition() {
     let wanted = [[true, true, false], [true, true, true], [false, true, true]];
-    let (r, c) = (
-        RandomDescriptors::new(24, [5, 4, 3], 1),
-        RandomDescriptors::new(24, [6, 2, 4], 2),
-    );
+    let r = RandomDescriptors::new(24, [5, 4, 3], 1);
+    let c = RandomDescriptors::new(24, [6, 2, 4], 2);
     // Factors that differ only by powers of two keep the reference's f64 sums exact.
     let pow = |s: &RandomDescriptors| RandomDescriptors {
         factors: s
@@ -70,7 +69,8 @@ fn scalar_twin_follows_the_definition() {
         codes: s.codes.clone(),
         ..*s
     };
-    let (r, c) = (pow(&r), pow(&c));
+    let r = pow(&r);
+    let c = pow(&c);
     let got = maxima_at(Simd::SCALAR, c.quantised(24), r.quantised(24), &wanted);
     let (best_column, best_row) = plain(c.quantised(24), r.quantised(24), &wanted);
     for section in 0..3 {
@@ -93,7 +93,8 @@ fn scalar_twin_follows_the_definition() {
 fn extreme_codes_do_not_saturate() {
     for simd in Simd::all() {
         let dim = 1024;
-        let (codes, factors) = (vec![-127i8; dim], [1.0f32]);
+        let codes = vec![-127i8; dim];
+        let factors = [1.0f32];
         let one = Int8Descriptors {
             dim,
             counts: [1, 0, 0],
@@ -116,17 +117,13 @@ fn extreme_codes_do_not_saturate() {
 #[test]
 fn packing_again_forgets_the_columns_before() {
     for simd in Simd::all() {
-        let (large, small, rows) = (
-            RandomDescriptors::new(40, [30, 20, 10], 5),
-            RandomDescriptors::new(7, [2, 1, 3], 6),
-            RandomDescriptors::new(7, [4, 4, 4], 7),
-        );
+        let large = RandomDescriptors::new(40, [30, 20, 10], 5);
+        let small = RandomDescriptors::new(7, [2, 1, 3], 6);
+        let rows = RandomDescriptors::new(7, [4, 4, 4], 7);
         let wanted = [[true; 3]; 3];
-        let (mut packed, mut out, mut scratch) = (
-            PackedColumns::new(simd),
-            BlockMaxima::default(),
-            Scratch::default(),
-        );
+        let mut packed = PackedColumns::new(simd);
+        let mut out = BlockMaxima::default();
+        let mut scratch = Scratch::default();
         packed.pack(large.quantised(40));
         block_maxima(
             &packed,
@@ -160,10 +157,8 @@ fn counts_that_wrap_around_are_refused() {
 #[test]
 #[should_panic(expected = "different lengths")]
 fn descriptors_of_different_lengths_are_refused() {
-    let (a, b) = (
-        RandomDescriptors::new(8, [1, 1, 1], 1),
-        RandomDescriptors::new(9, [1, 1, 1], 1),
-    );
+    let a = RandomDescriptors::new(8, [1, 1, 1], 1);
+    let b = RandomDescriptors::new(9, [1, 1, 1], 1);
     maxima_at(
         Simd::SCALAR,
         a.quantised(8),
@@ -179,11 +174,15 @@ fn counts() -> impl Strategy<Value = [usize; 3]> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
     #[test]
-    fn every_level_gives_the_bits_of_the_scalar_twin(
-        dim in 1usize..140, rows in counts(), columns in counts(), seed: u64,
+    fn every_level_gives_the_bits_of_the_scalar_reference(
+        dim in 1usize..140,
+        rows in counts(),
+        columns in counts(),
+        seed: u64,
         wanted in proptest::array::uniform3(proptest::array::uniform3(any::<bool>())),
     ) {
-        let (r, c) = (RandomDescriptors::new(dim, rows, seed), RandomDescriptors::new(dim, columns, !seed));
+        let r = RandomDescriptors::new(dim, rows, seed);
+        let c = RandomDescriptors::new(dim, columns, !seed);
         let expected = maxima_at(Simd::SCALAR, c.quantised(dim), r.quantised(dim), &wanted);
         for simd in Simd::all() {
             let got = maxima_at(simd, c.quantised(dim), r.quantised(dim), &wanted);

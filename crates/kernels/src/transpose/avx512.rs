@@ -1,8 +1,8 @@
 //! AVX-512: squares of sixteen by sixteen words in registers.
 //!
 //! Transposing a square of side 2d means exchanging the upper right quarter with the lower left
-//! one, then transposing all four quarters likewise. The four rounds, with d = 8, 4, 2 and 1,
-//! exchange the quarters of all squares of side 2d at once, by pairs of rows d apart.
+//! one, then transposing all four quarters in the same way. The four rounds, with d = 8, 4, 2 and
+//! 1, exchange the quarters of all squares of side 2d at once, by pairs of rows d apart.
 
 use super::SourceBlock;
 use super::scalar::transpose_row;

@@ -15,8 +15,8 @@ pub(super) fn draw(
     for (i, four) in (1u64..).zip(positions.iter_mut()) {
         *four = mix(counter.wrapping_add(STEP.wrapping_mul(i)));
     }
-    // On a big-endian machine the fields of a number lie in memory in the reverse order. It does not
-    // matter to the loop over all fields, and the second conversion undoes the first.
+    // On a big-endian machine the fields of a number lie in memory in the reverse order. It does
+    // not matter to the loop over all fields, and the second conversion undoes the first.
     for four in positions.iter_mut() {
         *four = four.to_le();
     }

@@ -6,16 +6,18 @@ use proptest::prelude::*;
 proptest! {
     #[test]
     fn every_level_draws_the_sequence_of_the_definition(
-        seed: u64, points in prop_oneof![4usize..12, 4usize..2000, 60_000usize..80_000],
+        seed: u64,
+        points in prop_oneof![4usize..12, 4usize..2000, 60_000usize..80_000],
         parts in prop::collection::vec(0usize..150, 1..6),
     ) {
         for simd in Simd::all() {
-            let (mut sampler, mut twin) = (Sampler::new(seed), OneByOne::new(seed));
+            let mut sampler = Sampler::new(seed);
+            let mut reference = OneByOne::new(seed);
             for &part in &parts {
                 let mut samples = vec![[0; 4]; part];
                 sampler.fill(simd, points, &mut samples);
                 for sample in samples {
-                    prop_assert_eq!(sample, twin.next(points));
+                    prop_assert_eq!(sample, reference.next(points));
                 }
             }
         }
@@ -24,7 +26,8 @@ proptest! {
 
 #[test]
 fn every_position_is_drawn_and_four_always_differ() {
-    let (mut sampler, mut samples) = (Sampler::new(7), vec![[0; 4]; 4000]);
+    let mut sampler = Sampler::new(7);
+    let mut samples = vec![[0; 4]; 4000];
     sampler.fill(Simd::best(), 37, &mut samples);
     assert!(
         samples
