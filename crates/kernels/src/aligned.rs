@@ -1,4 +1,7 @@
-//! Buffers that start on a cache line, so that no vector load of a packed panel straddles two.
+//! Buffers that start on a cache line.
+//!
+//! A vector load that straddles two cache lines takes twice as long as one that does not. `Vec`
+//! aligns its elements by their type only, so packed panels are kept in these buffers.
 
 use std::ops::{Deref, DerefMut};
 
@@ -6,8 +9,7 @@ use std::ops::{Deref, DerefMut};
 #[repr(C, align(64))]
 struct CacheLine([u8; 64]);
 
-/// Elements from a 64-byte boundary on, zeroed when made. The length is fixed by
-/// [`resize`](Self::resize).
+/// Elements from a 64-byte boundary on. The length changes by [`resize`](Self::resize) only.
 #[derive(Debug, Clone)]
 pub struct AlignedBuffer<T> {
     lines: Vec<CacheLine>,
@@ -33,8 +35,9 @@ impl<T: bytemuck::Pod> AlignedBuffer<T> {
         buffer
     }
 
-    /// Changes the length, keeping what fits; elements gained are zero or what a longer life left
-    /// there. Allocates only when it has never been this long.
+    /// Changes the length and keeps the elements that fit. Elements that are added are zero, or
+    /// what they were when the buffer was last that long. Allocates only if the buffer has never
+    /// been this long.
     pub fn resize(&mut self, len: usize) {
         let lines = (len * size_of::<T>()).div_ceil(size_of::<CacheLine>());
         if lines > self.lines.len() {

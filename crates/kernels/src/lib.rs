@@ -1,55 +1,72 @@
-//! SIMD inner loops with scalar twins. The only `unsafe` code of the crate.
+//! The inner loops of PlaceFormer, written for the vector instructions of the CPU at hand. This is
+//! the only crate of the project with `unsafe` code.
 //!
-//! | module | holds |
+//! Extraction, search and re-ranking spend nearly all their time in a few loops. With vector
+//! instructions these are five to fifty times as fast as without, but a program for every CPU must
+//! find out at start which instructions there are. Every kernel here therefore exists for several
+//! instruction sets, takes a token ([`Simd`]) that tells which one to use, and has a portable
+//! version (`scalar`) as the reference for the others.
+//!
+//! Vector instructions are supported on x86-64 only: AVX2, AVX-512 and AMX. On other architectures,
+//! such as aarch64, everything builds and computes the same with the portable version, slowly.
+//!
+//! | module | computes |
 //! |---|---|
-//! | [`scan`] | one int8 vector against many: bounds on their distances, for the search |
-//! | [`simd`] | which instructions may be used: chosen once at start, or forced by `PLACEFORMER_SIMD` |
-//! | [`homography`] | four-point homographies and inlier counts, in vectors |
-//! | [`similarity`] | best partners among int8 descriptors: running row and column maxima |
-//! | [`gemm`], [`elementwise`], [`attention`] | the transformer: packed products, what lies between them, blocked softmax attention |
-//! | [`quantise`] | f32 vectors to int8 codes |
-//! | [`peak`] | what the machine can do at most, for benchmarks |
-//! | [`operand`], `dot` | the formats of a product: f32, bf16, int8 |
-//! | `lanes`, `tiles`, [`aligned`] | vector registers by level; matrix registers (AMX); buffers on cache lines |
-//! | `transpose` | words of rows to words of columns |
+//! | [`gemm`] | matrix products with a packed right-hand side, in f32, bf16 and int8 |
+//! | [`operand`] | the number formats of products; packing of left-hand sides |
+//! | [`elementwise`] | LayerNorm, softmax, and the epilogues of products (bias, GELU, residual) |
+//! | [`attention`] | softmax attention of a block of query tokens |
+//! | [`scan`] | bounds on the distances between one global descriptor and many |
+//! | [`similarity`] | the best partner of every local descriptor of two images |
+//! | [`homography`] | RANSAC's homographies of four correspondences, and inlier counts |
+//! | [`quantise`] | int8 codes of f32 vectors |
+//! | [`peak`] | the most that the machine can compute, for benchmarks |
+//! | [`simd`] | which instruction set is used: the best, or that of `PLACEFORMER_SIMD` |
+//! | [`aligned`] | buffers that start on a cache line |
+//! | `registers` | vector registers as types that only code for their instruction set can make |
+//! | `transpose` | transposition of blocks of words |
 //!
-//! Every kernel takes a [`Simd`] and has a portable twin, which tests compare it with over odd
-//! sizes. Where tests ran on a CPU without AVX-512 or AMX, that level is still guarded:
-//! [`self_check`] compares every kernel with its twin on the machine at hand before the program
-//! computes anything, and a level that disagrees is refused with an error.
+//! # How a kernel is organised
+//!
+//! A kernel is a folder. `mod.rs` has the public functions, which check their arguments and then
+//! call `dispatch!(simd, kernel(arguments))`. That macro is the one way from a token to code: it
+//! calls the function `kernel` in the module `scalar`, `avx2`, `avx512` or, if asked for, `amx` of
+//! the folder. In the last three, functions are compiled for their instructions by
+//! `#[target_feature]`. Calling them is unsafe on a CPU that lacks those; the token proves that
+//! this one has them, since [`Simd`] cannot be made for a level that the CPU lacks.
+//!
+//! Where the algorithm is the same for every instruction set, it is written once as a generic
+//! function over the traits in `registers`, and the four modules call it with their registers.
+//! Where the algorithm depends on particular instructions, the modules differ.
+//!
+//! Modules with x86 intrinsics or assembly are behind `cfg(target_arch = "x86_64")`, so no other
+//! target sees them; a test keeps them out of every other module.
+//!
+//! # How results are kept right
+//!
+//! `check.rs` in each folder compares a level with the portable version, and [`self_check`] runs
+//! all of them on the machine at hand before the program computes anything. Property tests do the
+//! same over many sizes. Integers agree exactly everywhere; for floats each kernel tells whether
+//! its bits are the same at every level.
 
 pub mod aligned;
 pub mod attention;
-mod dot;
+mod dispatch;
 pub mod elementwise;
 pub mod gemm;
-#[allow(
-    clippy::needless_range_loop,
-    reason = "lanes, corners and halves index several arrays at once"
-)]
 pub mod homography;
-mod lanes;
 pub mod operand;
 pub mod peak;
-#[allow(
-    clippy::needless_range_loop,
-    reason = "lanes index several arrays at once"
-)]
 pub mod quantise;
+mod registers;
 pub mod scan;
+mod self_check;
 pub mod simd;
-#[allow(
-    clippy::needless_range_loop,
-    reason = "sections and halves index several arrays at once"
-)]
 pub mod similarity;
 mod testing;
-#[cfg(target_arch = "x86_64")]
-mod tiles;
 mod transpose;
 
-use std::sync::OnceLock;
-
+pub use self_check::self_check;
 pub use simd::{Simd, SimdError, SimdLevel};
 
 fn greatest_common_divisor(mut a: usize, mut b: usize) -> usize {
@@ -57,70 +74,4 @@ fn greatest_common_divisor(mut a: usize, mut b: usize) -> usize {
         (a, b) = (b, a % b);
     }
     a
-}
-
-/// Compares one kernel at one level with its scalar twin on small odd inputs; tells the first
-/// difference.
-type Check = fn(Simd) -> Result<(), String>;
-
-/// Every kernel's check, by the kernel's name.
-const CHECKS: &[(&str, Check)] = &[
-    ("homography", homography::check),
-    ("scan", scan::check),
-    ("quantise", quantise::check),
-    ("similarity", similarity::check),
-    ("gemm", gemm::check),
-    ("elementwise", elementwise::check),
-    ("attention", attention::check),
-];
-
-/// Chooses the level and compares every kernel at it with its scalar twin: a few milliseconds, once
-/// in a process however often it is asked.
-///
-/// # Errors
-/// `PLACEFORMER_SIMD` names no level or one this CPU lacks; or a kernel disagrees with its twin.
-pub fn self_check() -> Result<Simd, SimdError> {
-    static OUTCOME: OnceLock<Result<Simd, SimdError>> = OnceLock::new();
-    let check = || {
-        let simd = simd::try_selected()?;
-        check_level(simd, CHECKS)?;
-        Ok(simd)
-    };
-    OUTCOME.get_or_init(check).clone()
-}
-
-fn check_level(simd: Simd, checks: &[(&'static str, Check)]) -> Result<(), SimdError> {
-    for &(kernel, check) in checks {
-        check(simd).map_err(|difference| SimdError::Disagrees {
-            kernel,
-            level: simd.level(),
-            difference,
-        })?;
-    }
-    Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_level_of_this_cpu_agrees_with_the_scalar_twins() {
-        for simd in Simd::all() {
-            check_level(simd, CHECKS).unwrap();
-        }
-    }
-
-    #[test]
-    fn a_kernel_that_disagrees_is_refused_by_name() {
-        let wrong: &[(&str, Check)] = &[
-            ("fine", |_| Ok(())),
-            ("broken", |_| Err("3 is not 4".into())),
-        ];
-        let error = check_level(Simd::SCALAR, wrong).unwrap_err().to_string();
-        assert!(
-            error.contains("broken") && error.contains("3 is not 4"),
-            "{error}"
-        );
-    }
 }

@@ -1,13 +1,13 @@
 //! Which instructions the kernels may use, decided once at start.
 //!
-//! A kernel takes a [`Simd`] and dispatches on its [`level`](Simd::level). The token cannot be made
-//! for a level the CPU lacks, so holding one is the proof that every call into a
-//! `#[target_feature]` function of that level needs. [`selected`] is what the process uses: the
-//! highest level of the CPU, or the one `PLACEFORMER_SIMD` forces. Asking for a level the CPU lacks
-//! is an error, never a quiet step down.
+//! A kernel takes a [`Simd`] token and runs the code for the token's [`level`](Simd::level). The
+//! token cannot be made for a level that the CPU lacks, so it proves that calling functions that
+//! were compiled for the level's instructions is sound. [`selected`] is what the process uses: the
+//! highest level of the CPU, or the one that `PLACEFORMER_SIMD` names. Asking for a level that the
+//! CPU lacks is an error; a lower one is never chosen silently.
 
 #[cfg(target_arch = "x86_64")]
-use super::tiles;
+use crate::registers::{amx, avx2, avx512};
 use std::fmt;
 use std::str::FromStr;
 use std::sync::OnceLock;
@@ -15,17 +15,16 @@ use std::sync::OnceLock;
 /// The environment variable that forces a level: `scalar`, `avx2`, `avx512` or `amx`.
 pub const SIMD_VARIABLE: &str = "PLACEFORMER_SIMD";
 
-/// A family of instructions, each including those before it.
+/// A set of instructions. Each level includes those before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum SimdLevel {
-    /// Portable Rust; the reference every other level is compared with.
+    /// Portable Rust, the reference that every other level is compared with.
     Scalar,
     /// AVX2, FMA, F16C and POPCNT.
     Avx2,
     /// AVX-512 F, BW, DQ, VL and VNNI on top of [`SimdLevel::Avx2`].
     Avx512,
-    /// Tiles of bf16 and int8 (AMX), for matrix products, and AVX-512 BF16 on top of
-    /// [`SimdLevel::Avx512`].
+    /// Matrix products of bf16 and int8 (AMX), and AVX-512 BF16, on top of [`SimdLevel::Avx512`].
     Amx,
 }
 
@@ -45,29 +44,11 @@ impl SimdLevel {
 
     #[cfg(target_arch = "x86_64")]
     fn is_available(self) -> bool {
-        let avx2 = || {
-            is_x86_feature_detected!("avx2")
-                && is_x86_feature_detected!("fma")
-                && is_x86_feature_detected!("f16c")
-                && is_x86_feature_detected!("popcnt")
-        };
-        let avx512 = || {
-            is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx512bw")
-                && is_x86_feature_detected!("avx512dq")
-                && is_x86_feature_detected!("avx512vl")
-                && is_x86_feature_detected!("avx512vnni")
-        };
         match self {
             Self::Scalar => true,
-            Self::Avx2 => avx2(),
-            Self::Avx512 => avx2() && avx512(),
-            Self::Amx => {
-                avx2()
-                    && avx512()
-                    && is_x86_feature_detected!("avx512bf16")
-                    && tiles::are_available()
-            }
+            Self::Avx2 => avx2::is_available(),
+            Self::Avx512 => avx2::is_available() && avx512::is_available(),
+            Self::Amx => Self::Avx512.is_available() && avx512::has_bf16() && amx::is_available(),
         }
     }
 
@@ -100,12 +81,13 @@ impl FromStr for SimdLevel {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SimdError {
-    /// The variable holds something else than a level.
+    /// The environment variable is not the name of a level.
     #[error(
-        "{SIMD_VARIABLE}={value:?} is not a SIMD level; use scalar, avx2, avx512 or amx, or leave it unset"
+        "{SIMD_VARIABLE}={value:?} is not a SIMD level; use scalar, avx2, avx512 or amx, \
+         or leave it unset"
     )]
     UnknownLevel {
-        /// What it holds.
+        /// Its value.
         value: String,
     },
     /// The CPU lacks instructions of the level asked for.
@@ -116,7 +98,7 @@ pub enum SimdError {
         /// The highest the CPU has.
         best: SimdLevel,
     },
-    /// A kernel gave another result than its scalar twin.
+    /// A kernel gave another result than its scalar reference.
     #[error(
         "the {level} kernel {kernel} disagrees with its scalar twin ({difference}); \
          refusing to compute with it: set {SIMD_VARIABLE} to a lower level and report this CPU"
@@ -126,7 +108,7 @@ pub enum SimdError {
         kernel: &'static str,
         /// The level it ran at.
         level: SimdLevel,
-        /// What differed, on which input.
+        /// What differed, and on which input.
         difference: String,
     },
 }
@@ -134,7 +116,7 @@ pub enum SimdError {
 /// Proof that the CPU has the instructions of a level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Simd {
-    // Private: unsafe blocks rely on a value existing only where its level is available.
+    // Private, because unsafe blocks rely on it: a value exists only if its level is available.
     level: SimdLevel,
 }
 
@@ -144,7 +126,10 @@ impl Simd {
         level: SimdLevel::Scalar,
     };
 
-    /// The token of `level`, if the CPU has it.
+    /// The token of `level`.
+    ///
+    /// # Errors
+    /// [`SimdError::Unavailable`] if the CPU lacks the level.
     pub fn new(level: SimdLevel) -> Result<Self, SimdError> {
         if level.is_available() {
             Ok(Self { level })
@@ -161,7 +146,7 @@ impl Simd {
         Self::all().last().unwrap_or(Self::SCALAR)
     }
 
-    /// Every level of this CPU, ascending: what tests run a kernel at.
+    /// Every level of this CPU, ascending. Tests run kernels at all of them.
     pub fn all() -> impl Iterator<Item = Self> {
         SimdLevel::ALL
             .into_iter()
@@ -182,16 +167,17 @@ impl Simd {
         self.level
     }
 
-    /// Whether `vdpbf16ps` may be used too: not every CPU of [`SimdLevel::Avx512`] has it.
+    /// Whether products of bf16 (`vdpbf16ps`) may be used too: not every CPU of
+    /// [`SimdLevel::Avx512`] has them.
     pub fn has_bf16_dot(self) -> bool {
         #[cfg(target_arch = "x86_64")]
-        return self.level >= SimdLevel::Avx512 && is_x86_feature_detected!("avx512bf16");
+        return self.level >= SimdLevel::Avx512 && avx512::has_bf16();
         #[cfg(not(target_arch = "x86_64"))]
         return false;
     }
 }
 
-/// The level for a value of [`SIMD_VARIABLE`]; the best of the CPU where it is unset or empty.
+/// The level for a value of [`SIMD_VARIABLE`]: the best of the CPU if it is unset or empty.
 fn choose(forced: Option<&str>) -> Result<Simd, SimdError> {
     match forced.map(str::trim).filter(|text| !text.is_empty()) {
         Some(text) => Simd::new(text.parse()?),
@@ -201,15 +187,17 @@ fn choose(forced: Option<&str>) -> Result<Simd, SimdError> {
 
 static SELECTED: OnceLock<Result<Simd, SimdError>> = OnceLock::new();
 
-/// What this process computes with; the variable is read at the first call only.
+/// The level that this process computes with. The environment variable is read by the first call
+/// only.
 ///
 /// # Errors
-/// The variable names no level, or one the CPU lacks. Programs call this at start (through
-/// [`self_check`](super::self_check)) and stop on an error.
+/// The variable names no level, or one that the CPU lacks. Programs call this at start, through
+/// [`self_check`](super::self_check), and stop on an error.
 pub fn try_selected() -> Result<Simd, SimdError> {
     let read = || {
+        let value = std::env::var_os(SIMD_VARIABLE);
         choose(
-            std::env::var_os(SIMD_VARIABLE)
+            value
                 .map(|value| value.to_string_lossy().into_owned())
                 .as_deref(),
         )
@@ -217,11 +205,11 @@ pub fn try_selected() -> Result<Simd, SimdError> {
     SELECTED.get_or_init(read).clone()
 }
 
-/// [`try_selected`] for the kernels' callers.
+/// As [`try_selected`], for code that runs after a program has checked at start.
 ///
 /// # Panics
-/// Where `try_selected` fails: going on with other instructions than those asked for would be a
-/// silent fallback, and a program that checked at start never comes here.
+/// If `try_selected` fails: computing with other instructions than those asked for would hide the
+/// error.
 pub fn selected() -> Simd {
     match try_selected() {
         Ok(simd) => simd,

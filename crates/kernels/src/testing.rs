@@ -1,4 +1,4 @@
-//! Inputs and comparisons for the kernels' self-checks and tests.
+//! Inputs and comparisons for the self-checks and tests of kernels.
 
 /// `len` values in about [-1, 1], the same for the same seed.
 pub(super) fn ramp(len: usize, seed: u32) -> Vec<f32> {
@@ -12,7 +12,7 @@ pub(super) fn ramp(len: usize, seed: u32) -> Vec<f32> {
     (0..len).map(|_| next()).collect()
 }
 
-/// Whether `actual` is farther than `tolerance` from `expected`, or not a number.
+/// Whether `actual` is NaN, or differs from `expected` by more than `tolerance`.
 pub(super) fn differ(actual: f32, expected: f64, tolerance: f64) -> bool {
     let difference = (f64::from(actual) - expected).abs();
     difference.is_nan() || difference > tolerance

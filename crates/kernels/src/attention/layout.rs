@@ -1,27 +1,29 @@
-//! How the queries, keys and values of an image lie in memory, and how finished projections get
-//! there.
+//! How the queries, keys and values of an image lie in memory, and how finished blocks of their
+//! projections are written there.
 //!
-//! Keys and values lie as the two products read them, cut into chunks of
-//! [`chunk_rows`](super::chunk_rows) tokens so that each chunk can be written by the thread that
-//! computed it: keys `[chunk][head][key panel][words of head_dim][columns]`, values
-//! `[chunk][head][value panel][words of chunk_rows][columns]`, panels `columns` wide as in
-//! [`Tiling`].
+//! The two products of attention read keys and values as packed right-hand sides. They are cut into
+//! chunks of [`chunk_rows`](super::chunk_rows) tokens, so that the thread that computes a chunk can
+//! write it without waiting for others. With panels `columns` wide as in [`Tiling`]:
 //!
-//! In int8 a query and a key have one factor for all dimensions of their head. A panel of keys ends
-//! in a row of factors and one of the offsets that the queries' 128 adds to sums; a chunk's queries
-//! end in their factors, `[head][chunk_rows]`.
+//! - queries of a chunk: `[chunk_rows][heads][words of head_dim]`;
+//! - keys: `[chunks][heads][panels of chunk_rows][words of head_dim][columns]`;
+//! - values: `[chunks][heads][panels of head_dim][words of chunk_rows][columns]`.
+//!
+//! In int8, a query and a key have one factor for all dimensions of their head. Each panel of keys
+//! is followed by a row of factors and a row of the offsets that the 128 in the codes of queries
+//! adds to sums. A chunk's queries are followed by their factors, `[heads][chunk_rows]`.
 
 use crate::Simd;
-use crate::gemm::{Panel, Tiling, multiply_panel};
-use crate::operand::{Format, Left, OperandBuffer, Rows, quantise_into};
-use crate::transpose::transpose;
+use crate::gemm::{RightPanel, Tiling, multiply_panel};
+use crate::operand::{Format, LeftOperand, OperandBuffer, WordRows, quantise_into};
+use crate::transpose::{SourceBlock, transpose};
 
 /// How the tokens of an image and their heads are laid out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AttentionShape {
     /// Format of queries and keys.
     pub scores: Format,
-    /// Format of weights and values: f32 or bf16.
+    /// Format of attention weights and of values: f32 or bf16.
     pub mix: Format,
     /// Tokens of an image, CLS included.
     pub tokens: usize,
@@ -54,113 +56,122 @@ impl AttentionShape {
         self.heads * self.head_words()
     }
 
-    /// Words of one chunk's queries and what their codes are worth.
+    /// Words of one chunk's queries, and of the factors of their codes.
     pub fn queries_len(&self) -> usize {
-        self.chunk_rows
-            * (self.query_len()
-                + if self.scores == Format::Int8 {
-                    self.heads
-                } else {
-                    0
-                })
+        let factors = if self.scores == Format::Int8 {
+            self.heads
+        } else {
+            0
+        };
+        self.chunk_rows * (self.query_len() + factors)
     }
 
-    /// Where in a chunk's queries (`[chunk_rows, query_len]`) a block of their projection begins.
-    pub fn query_at(&self, place: Place) -> usize {
-        place.token * self.query_len()
-            + place.head * self.head_words()
-            + self.scores.words(place.dim)
+    /// Index in a chunk's queries, `[chunk_rows, query_len]`, at which a block of their projection
+    /// begins.
+    pub fn query_at(&self, position: BlockPosition) -> usize {
+        position.token * self.query_len()
+            + position.head * self.head_words()
+            + self.scores.words(position.dim)
     }
 
-    /// Where in a chunk's queries the factor of a token's begins, if they have one.
+    /// Index in a chunk's queries of the factor of one token's query, if there are factors.
     pub(super) fn query_factor_at(&self, head: usize, token: usize) -> usize {
         self.chunk_rows * (self.query_len() + head) + token
     }
 
+    /// Words of one token's query or key in one head.
     pub(super) fn head_words(&self) -> usize {
         self.scores.words(self.head_dim)
     }
 
-    /// Words of a panel of keys for each of its columns.
+    /// Rows of a panel of keys, one word of each column, with those of factors and offsets.
     pub(super) fn panel_rows(&self) -> usize {
         self.head_words() + if self.scores == Format::Int8 { 2 } else { 0 }
     }
 
+    /// Words of one chunk's keys in one head.
     pub(super) fn head_keys(&self) -> usize {
         self.panel_rows() * self.chunk_rows
     }
 
+    /// Words of one chunk's values in one head.
     pub(super) fn head_values(&self) -> usize {
         self.mix.words(self.chunk_rows) * self.head_dim
     }
 
+    /// Tokens of all chunks if the last one were full.
     pub(super) fn padded_tokens(&self) -> usize {
         self.chunks() * self.chunk_rows
     }
 }
 
-/// Where a finished block of a projection belongs.
+/// Which part of a chunk's queries, keys or values a finished block of their projection is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Place {
+pub struct BlockPosition {
     /// The head.
     pub head: usize,
-    /// Its dimension that the block's first column is.
+    /// The dimension of the head that the block's first column holds.
     pub dim: usize,
-    /// The token of the chunk that the block's first row is; whole panels of keys.
+    /// The token within the chunk that the block's first row holds. For keys it must be the first
+    /// of a panel.
     pub token: usize,
 }
 
-/// Writes finished rows of the key projection, in f32 or bf16, to their places in a chunk's keys.
+/// Writes finished rows of the key projection, `[n, words]` in f32 or bf16, to a chunk's keys.
 ///
 /// # Panics
-/// If `keys` is not a chunk of `shape`, or the place not the first of a panel.
+/// If `keys` is not a chunk of `shape`, or the position not the start of a panel.
 pub fn store_keys(
     simd: Simd,
     shape: &AttentionShape,
-    place: Place,
-    block: Rows<'_>,
+    position: BlockPosition,
+    block: WordRows<'_>,
     keys: &mut [u32],
 ) {
-    let first = shape.scores.words(place.dim) * Tiling::of(simd).columns;
-    for (rows, panel) in key_panels(simd, shape, place, block, keys) {
-        let size = (rows.len() / block.stride, block.stride);
-        transpose(
-            simd,
-            (rows, block.stride),
-            size,
-            &mut panel[first..],
-            Tiling::of(simd).columns,
-        );
+    let columns = Tiling::of(simd).columns;
+    let first = shape.scores.words(position.dim) * columns;
+    for (rows, panel) in key_panels(simd, shape, position, block, keys) {
+        let source = SourceBlock {
+            words: rows,
+            stride: block.stride,
+            rows: rows.len() / block.stride,
+            columns: block.stride,
+        };
+        transpose(simd, source, &mut panel[first..], columns);
     }
 }
 
-/// The rows of `block` by the panel of keys they belong into.
+/// The rows of `block`, divided by panels of keys, each with the panel that they belong into.
 fn key_panels<'a>(
     simd: Simd,
     shape: &AttentionShape,
-    place: Place,
-    block: Rows<'a>,
+    position: BlockPosition,
+    block: WordRows<'a>,
     keys: &'a mut [u32],
 ) -> impl Iterator<Item = (&'a [u32], &'a mut [u32])> {
     let columns = Tiling::of(simd).columns;
     assert_eq!(keys.len(), shape.keys_len(), "not one chunk of keys");
-    assert_eq!(place.token % columns, 0, "keys are written by whole panels");
-    let head = &mut keys[place.head * shape.head_keys()..][..shape.head_keys()];
+    assert_eq!(
+        position.token % columns,
+        0,
+        "keys are written by whole panels"
+    );
+    let head = &mut keys[position.head * shape.head_keys()..][..shape.head_keys()];
     let panels = head
         .chunks_exact_mut(shape.panel_rows() * columns)
-        .skip(place.token / columns);
+        .skip(position.token / columns);
     block.data.chunks(columns * block.stride).zip(panels)
 }
 
-/// Writes the queries of a head, rows `[n, head_dim]` of f32 whose first is the place's token, as
-/// codes to their places in a chunk's queries.
+/// Quantises queries of one head, `[n, head_dim]` f32 from the position's token on, and writes the
+/// codes to a chunk's queries.
 ///
 /// # Panics
 /// If `queries` is not a chunk of `shape`, or the scores are not int8.
 pub fn store_query_codes(
     simd: Simd,
     shape: &AttentionShape,
-    place: Place,
+    position: BlockPosition,
     rows: &[f32],
     queries: &mut [u32],
 ) {
@@ -170,50 +181,64 @@ pub fn store_query_codes(
         "not one chunk of codes"
     );
     let (codes, factors) = queries.split_at_mut(shape.chunk_rows * shape.query_len());
-    let factors = &mut factors[shape.query_factor_at(place.head, place.token) - codes.len()..];
+    let factors =
+        &mut factors[shape.query_factor_at(position.head, position.token) - codes.len()..];
     let factors = bytemuck::cast_slice_mut(&mut factors[..rows.len() / shape.head_dim]);
     let codes = (
-        &mut codes[shape.query_at(Place { dim: 0, ..place })..],
+        &mut codes[shape.query_at(BlockPosition { dim: 0, ..position })..],
         shape.query_len(),
     );
     quantise_into(simd, shape.head_dim, (rows, shape.head_dim), codes, factors);
 }
 
-/// As [`store_query_codes`], to a chunk's keys; `buffer` is room to work in.
+/// As [`store_query_codes`], for a chunk's keys; `buffer` is scratch memory.
 ///
 /// # Panics
 /// As [`store_keys`], or if the scores are not int8.
 pub fn store_key_codes(
     simd: Simd,
     shape: &AttentionShape,
-    place: Place,
+    position: BlockPosition,
     rows: &[f32],
     buffer: &mut OperandBuffer,
     keys: &mut [u32],
 ) {
     assert_eq!(shape.scores, Format::Int8, "keys are not codes");
-    let (columns, words, width) = (Tiling::of(simd).columns, shape.head_words(), shape.head_dim);
+    let columns = Tiling::of(simd).columns;
+    let words = shape.head_words();
+    let width = shape.head_dim;
     let packed = buffer.pack(simd, Format::Int8, rows.len() / width, width, (rows, width));
     let factors = packed.factors.chunks(columns);
-    for ((rows, panel), factors) in key_panels(simd, shape, place, packed.rows, keys).zip(factors) {
+    for ((rows, panel), factors) in
+        key_panels(simd, shape, position, packed.rows, keys).zip(factors)
+    {
         let (codes, tail) = panel.split_at_mut(words * columns);
-        transpose(simd, (rows, words), (factors.len(), words), codes, columns);
-        // From unsigned around 128 to signed.
-        codes.iter_mut().for_each(|word| *word ^= ZERO_CODES);
+        let source = SourceBlock {
+            words: rows,
+            stride: words,
+            rows: factors.len(),
+            columns: words,
+        };
+        transpose(simd, source, codes, columns);
+        // Subtracts 128 from each code, which leaves them signed.
+        for word in codes.iter_mut() {
+            *word ^= ZERO_CODES;
+        }
         let (of_columns, offsets) = tail.split_at_mut(columns);
         of_columns[..factors.len()].copy_from_slice(bytemuck::cast_slice(factors));
-        store_offsets(simd, Panel::whole(codes, words), offsets);
+        store_offsets(simd, RightPanel::whole(codes, words), offsets);
     }
 }
 
-/// Four codes on the left that stand for zero.
+/// Four codes of a left-hand side that stand for zero.
 const ZERO_CODES: u32 = 0x8080_8080;
 
-/// A query of zeros, as wide as the tokens of any backbone.
+/// A query of zeros, as wide as a head of any backbone.
 static ZERO_QUERY: [u32; 512] = [ZERO_CODES; 512];
 
-/// What a query of zeros gives, which is what every query's sums are too high by.
-fn store_offsets(simd: Simd, panel: Panel<'_>, offsets: &mut [u32]) {
+/// Writes the sums that a query of zeros gives to `offsets`: every query's sums are too high by
+/// them.
+fn store_offsets(simd: Simd, panel: RightPanel<'_>, offsets: &mut [u32]) {
     let tile = Tiling::of(simd);
     let mut sums = [0.0; 16 * 32];
     let sums = &mut sums[..tile.row_step * tile.columns];
@@ -221,7 +246,7 @@ fn store_offsets(simd: Simd, panel: Panel<'_>, offsets: &mut [u32]) {
         simd,
         Format::Int8,
         tile.row_step,
-        Rows {
+        WordRows {
             data: &ZERO_QUERY,
             stride: 0,
         },
@@ -232,22 +257,23 @@ fn store_offsets(simd: Simd, panel: Panel<'_>, offsets: &mut [u32]) {
     offsets.copy_from_slice(bytemuck::cast_slice(&sums[..tile.columns]));
 }
 
-/// As [`store_keys`], for values: their words hold the same dimension of neighbouring tokens.
+/// As [`store_keys`], for values: their words hold the same dimension of neighbouring tokens, where
+/// those of the block hold neighbouring dimensions of the same token.
 ///
 /// # Panics
 /// If `values` is not a chunk of `shape`.
 pub fn store_values(
     simd: Simd,
     shape: &AttentionShape,
-    place: Place,
-    block: Rows<'_>,
+    position: BlockPosition,
+    block: WordRows<'_>,
     values: &mut [u32],
 ) {
     let columns = Tiling::of(simd).columns;
     assert_eq!(values.len(), shape.values_len(), "not one chunk of values");
     let words = |tokens: usize| shape.mix.words(tokens);
-    let row = place.dim / columns * words(shape.chunk_rows) + words(place.token);
-    let panel = &mut values[place.head * shape.head_values() + row * columns..];
+    let row = position.dim / columns * words(shape.chunk_rows) + words(position.token);
+    let panel = &mut values[position.head * shape.head_values() + row * columns..];
     if shape.mix == Format::F32 {
         return panel[..block.data.len()].copy_from_slice(block.data);
     }
@@ -264,14 +290,14 @@ pub fn store_values(
     }
 }
 
-/// The query rows of one head from row `first` of a chunk's queries on.
+/// The queries of one head in a chunk's queries, from row `first` on, as a left-hand side.
 pub(super) fn head_queries<'a>(
     shape: &AttentionShape,
     head: usize,
     first: usize,
     queries: &'a [u32],
-) -> Left<'a> {
-    let at = shape.query_at(Place {
+) -> LeftOperand<'a> {
+    let at = shape.query_at(BlockPosition {
         head,
         dim: 0,
         token: first,
@@ -280,8 +306,8 @@ pub(super) fn head_queries<'a>(
         Format::Int8 => bytemuck::cast_slice(&queries[shape.query_factor_at(head, first)..]),
         _ => &[],
     };
-    Left {
-        rows: Rows {
+    LeftOperand {
+        rows: WordRows {
             data: &queries[at..],
             stride: shape.query_len(),
         },

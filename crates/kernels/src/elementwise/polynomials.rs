@@ -1,13 +1,19 @@
 //! `exp2` and GELU by polynomials, in vectors.
 //!
-//! 2^f on [-0.5, 0.5] is a polynomial of degree 5 (relative error 1e-7), or 4 (3e-6) where the
-//! result is rounded to eight bits anyway. The normal distribution in GELU is 1/2 + x P(x^2) up to
-//! a limit, 0 or 1 beyond, with P of degree 13 in x^2 mapped to [-1, 1] up to 5.3 (absolute error
-//! of GELU 8e-7), or 7 up to 4.2 (8e-5) where the next product has eight bits. All were fitted for
-//! the smallest maximal error; P is just 1 / (2 limit) at the limit, so that nothing has to be cut
-//! off there.
+//! Calls of the mathematical library take one number at a time and would cost more than the matrix
+//! products. Polynomials need only multiplications and additions.
+//!
+//! `2^x` is `2^n 2^f` with a whole n and f in [-0.5, 0.5], where 2^f is a polynomial of degree 5
+//! (relative error 1e-7), or of degree 4 (3e-6) if the result is rounded to eight bits anyway.
+//!
+//! GELU needs the normal distribution, which is `1/2 + x P(x^2)` up to a limit, and 0 or 1 beyond
+//! it. P has degree 13 and the limit is 5.3 (absolute error of GELU 8e-7), or degree 7 and 4.2
+//! (8e-5) if the next product has eight bits. P is a polynomial in x^2 mapped linearly to [-1, 1].
+//!
+//! All polynomials were fitted for the smallest maximal error. P was constrained to 1 / (2 limit)
+//! at the limit, so that `1/2 + x P(x^2)` is exactly 0 or 1 there and clamping x is enough.
 
-use crate::lanes::{Lanes, ROUNDING};
+use crate::registers::{FloatVector, ROUNDING, VectorIsa};
 
 /// 2^f on [-0.5, 0.5], highest power first.
 pub(super) const EXP2: [f32; 6] = [
@@ -28,32 +34,28 @@ pub(super) const EXP2_SHORT: [f32; 5] = [
     0.999_999_3,
 ];
 
-/// 2^x for x up to 127 by a polynomial of 2^f; smaller than -126 gives 2^-126, NaN stays NaN.
+/// 2^x for x up to 127, by a polynomial of 2^f for the fraction f. What is smaller than -126 gives
+/// 2^-126, NaN stays NaN.
 #[inline(always)]
-pub(super) unsafe fn exp2<V: Lanes>(x: V, polynomial: &[f32]) -> V {
-    // SAFETY: arithmetic only; the caller's level is available.
-    unsafe {
-        let x = V::splat(-126.0).max(x);
-        let whole = x.add(V::splat(ROUNDING)).sub(V::splat(ROUNDING));
-        horner(x.sub(whole), polynomial).scale(whole)
-    }
+pub(super) fn exp2<I: VectorIsa>(isa: I, x: I::Floats, polynomial: &[f32]) -> I::Floats {
+    let x = isa.splat(-126.0).max(x);
+    let whole = x.add(isa.splat(ROUNDING)).sub(isa.splat(ROUNDING));
+    horner(isa, x.sub(whole), polynomial).scale(whole)
 }
 
-/// x times the normal distribution's share below x: x/2 + x^2 P(x^2), with x in P and before it
-/// kept to the limit.
+/// GELU: x times the normal distribution's share below x, which is `x (1/2 + c P(c^2))` with c the
+/// value x clamped to the limit and P a polynomial.
 #[inline(always)]
-pub(super) unsafe fn gelu<V: Lanes, const N: usize>(
-    x: V,
+pub(super) fn gelu<I: VectorIsa, const N: usize>(
+    isa: I,
+    x: I::Floats,
     (limit, polynomial): &(f32, [f32; N]),
-) -> V {
-    // SAFETY: as in `exp2`.
-    unsafe {
-        let kept = V::splat(-limit).max(V::splat(*limit).min(x));
-        let mapped = kept
-            .mul(kept)
-            .mul_add(V::splat(2.0 / (limit * limit)), V::splat(-1.0));
-        x.mul(kept.mul_add(horner(mapped, polynomial), V::splat(0.5)))
-    }
+) -> I::Floats {
+    let clamped = isa.splat(-limit).max(isa.splat(*limit).min(x));
+    let square = clamped.mul(clamped);
+    let mapped = square.mul_add(isa.splat(2.0 / (limit * limit)), isa.splat(-1.0));
+    let share = clamped.mul_add(horner(isa, mapped, polynomial), isa.splat(0.5));
+    x.mul(share)
 }
 
 /// The limit, and P of the normal distribution 1/2 + x P(2 x^2 / limit^2 - 1), highest power first.
@@ -92,15 +94,12 @@ pub(super) const GELU_SHORT: (f32, [f32; 8]) = (
     ],
 );
 
-/// A polynomial, highest power first.
+/// The value of a polynomial at x; coefficients, at least one, from the highest power on.
 #[inline(always)]
-unsafe fn horner<V: Lanes>(x: V, coefficients: &[f32]) -> V {
-    // SAFETY: as in `exp2`; every caller passes at least one coefficient.
-    unsafe {
-        let mut value = V::splat(coefficients[0]);
-        for &coefficient in &coefficients[1..] {
-            value = value.mul_add(x, V::splat(coefficient));
-        }
-        value
+fn horner<I: VectorIsa>(isa: I, x: I::Floats, coefficients: &[f32]) -> I::Floats {
+    let mut value = isa.splat(coefficients[0]);
+    for &coefficient in &coefficients[1..] {
+        value = value.mul_add(x, isa.splat(coefficient));
     }
+    value
 }

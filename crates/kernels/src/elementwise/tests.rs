@@ -1,6 +1,8 @@
 //! Epilogues, LayerNorm and softmax against definitions and against each other, at every level.
 
+use super::check::{plain, reference_erf};
 use super::*;
+use crate::gemm::Tiling;
 use crate::testing::ramp;
 use proptest::prelude::*;
 
@@ -67,7 +69,8 @@ fn bf16_weights_are_the_f32_ones_rounded() {
     for simd in Simd::all().filter(|&simd| Format::Bf16.is_available(simd)) {
         for len in [1, 2, 15, 16, 17, 33, 769] {
             let row: Vec<f32> = ramp(len, 9).iter().map(|value| value * 8.0).collect();
-            let (mut exact, mut rounded) = (row.clone(), row);
+            let mut exact = row.clone();
+            let mut rounded = row;
             let [of_exact, of_rounded] = [Format::F32, Format::Bf16].map(|format| {
                 let scores = if format == Format::F32 {
                     &mut exact
@@ -98,10 +101,15 @@ fn bf16_weights_are_the_f32_ones_rounded() {
 
 proptest! {
     #[test]
-    fn every_level_agrees_with_the_scalar_twin(len in 1usize..200, seed in 0u32..1000, scale in 0.1f32..40.0) {
+    fn every_level_agrees_with_the_scalar_reference(
+        len in 1usize..200,
+        seed in 0u32..1000,
+        scale in 0.1f32..40.0,
+    ) {
         let row: Vec<f32> = ramp(len, seed).iter().map(|value| value * scale).collect();
         let run = |simd| {
-            let (mut normed, mut scores) = (vec![0.0; len], row.clone());
+            let mut normed = vec![0.0; len];
+            let mut scores = row.clone();
             normalize_rows(simd, len, 1e-6, &row, &mut normed);
             let reciprocal = exponentiate_row(simd, Format::F32, &mut scores);
             scale_rows(&[reciprocal], len, &mut scores, len);

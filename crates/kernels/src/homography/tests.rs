@@ -1,5 +1,7 @@
-//! The kernels of homographies against planted geometry, and every level against the scalar twin.
+//! The kernels of homographies against planted geometry, and every level against the scalar
+//! reference.
 
+use super::check::sample_pairs;
 use super::*;
 use proptest::prelude::*;
 
@@ -64,10 +66,8 @@ fn each_sample_has_its_own_bit_and_lane() {
     let mut samples = [[0; 4]; LANES];
     Sampler::new(5).fill(Simd::SCALAR, 64, &mut samples);
     for simd in Simd::all() {
-        let (bits, solved) = (
-            proper(simd, &pairs, &samples, 0.1),
-            solve(simd, &pairs, &samples),
-        );
+        let bits = proper(simd, &pairs, &samples, 0.1);
+        let solved = solve(simd, &pairs, &samples);
         for (lane, sample) in samples.iter().enumerate() {
             let alone = [*sample; LANES];
             assert_eq!(proper(simd, &pairs, &alone, 0.1) & 1, bits >> lane & 1);
@@ -114,7 +114,7 @@ fn counting_sees_every_correspondence_once_however_many_there_are() {
                 "{n}"
             );
         }
-        let mut xs = pairs.coordinates[0][..n].to_vec();
+        let mut xs = pairs.axis(0)[..n].to_vec();
         xs.sort_by(f32::total_cmp);
         assert!(xs.iter().enumerate().all(|(i, &x)| x == i as f32), "{n}");
     }
@@ -132,19 +132,27 @@ fn positions_beyond_the_pairs_are_refused() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(128))]
     #[test]
-    fn every_level_gives_the_bits_of_the_scalar_twin(n in 4usize..200, seed: u64, floor in 0usize..220) {
+    fn every_level_gives_the_bits_of_the_scalar_reference(
+        n in 4usize..200,
+        seed: u64,
+        floor in 0usize..220,
+    ) {
         let pairs = sample_pairs(n, seed);
         let mut samples = [[0; 4]; LANES];
         Sampler::new(seed >> 8).fill(Simd::SCALAR, n, &mut samples);
-        let (bits, twin) = (proper_scalar(&pairs, &samples, 0.1), solve_scalar(&pairs, &samples));
+        let bits = scalar::proper(&pairs, &samples, 0.1);
+        let reference = scalar::solve(&pairs, &samples);
         for simd in Simd::all() {
             prop_assert_eq!(proper(simd, &pairs, &samples, 0.1), bits);
             let ours = solve(simd, &pairs, &samples);
             for lane in (0..LANES).filter(|lane| bits >> lane & 1 == 1) {
-                prop_assert_eq!(ours.get(lane).map(f32::to_bits), twin.get(lane).map(f32::to_bits));
+                prop_assert_eq!(
+                    ours.get(lane).map(f32::to_bits),
+                    reference.get(lane).map(f32::to_bits)
+                );
                 prop_assert_eq!(
                     count_inliers(simd, &pairs, &ours.get(lane), floor),
-                    count_scalar(&pairs, &ours.get(lane), floor)
+                    scalar::count_inliers(&pairs, &ours.get(lane), floor)
                 );
             }
         }

@@ -1,213 +1,220 @@
 //! AVX-512 VNNI: tiles of 12 rows by 32 columns, products by `vpdpbusd`.
 //!
-//! The instruction multiplies unsigned by signed bytes, so columns are offset by 128, once for all
-//! candidates, and sums start at -128 times that of a row's codes. Written on a CPU without it:
-//! [`super::check`] must pass before this level is used.
+//! The instruction multiplies unsigned with signed bytes. So the columns are increased by 128, once
+//! for all candidates, and the sums of a row start at -128 times the sum of its codes.
 
-use super::driver::{self, Level};
-use super::{BlockMaxima, Blocks, Line, PackedColumns, Quantised, SECTIONS, Scratch};
-use crate::lanes;
+use super::packed::{CacheLine, for_each_column};
+use super::panels::{self, LaneBests, SimilarityIsa};
+use super::{BlockMaxima, Blocks, Int8Descriptors, PackedColumns, Scratch};
+use crate::registers::avx512::{Avx512Floats, Avx512Isa};
+use crate::registers::{first, first_mut};
 use std::arch::x86_64::*;
 
 /// Columns of a panel: two vectors.
 const PANEL: usize = 32;
-/// Rows of a tile: 12 x 2 accumulators of the 32 registers.
+
+/// Rows of a tile: 12 x 2 of the 32 registers hold sums.
 const TILE: usize = 12;
-/// Rows of a tile where fewer than [`TILE`] are left.
+
+/// Rows of a tile if fewer than [`TILE`] are left.
 const STEP: usize = 4;
+
+/// Columns of a vector.
 const LANES: usize = 16;
 
-/// What makes a signed code an unsigned one: added, or as the highest bit turned around.
+/// Added to a signed code, which inverts its highest bit, it makes the code unsigned.
 const OFFSET: u8 = 128;
 
-/// Lays columns out in panels: lines `2k` and `2k + 1` hold values `4k..4k + 4` of the first and
-/// last 16 columns.
-pub(super) fn pack(packed: &mut PackedColumns, columns: Quantised<'_>) {
-    let dim = columns.dim;
-    let depth = dim.div_ceil(4);
+/// See [`PackedColumns::pack`]: the two lines of group `k` of a panel hold the values `4k..4k + 4`
+/// of the first and of the last 16 columns.
+#[target_feature(enable = "avx512f,avx512bw")]
+pub(super) fn pack(packed: &mut PackedColumns, columns: Int8Descriptors<'_>) {
     packed.pack_factors(columns, PANEL);
+    let groups = Avx512Isa::groups(columns.dim);
+    let panels = packed.factors.len() / PANEL;
     packed.quads.clear();
     packed
         .quads
-        .resize(packed.factors.len() / PANEL * depth * 2, Line([OFFSET; 64]));
-    let mut panel_base = 0;
-    for section in 0..SECTIONS {
-        for local in 0..columns.counts[section] {
-            let codes = &columns.codes[(columns.start(section) + local) * dim..][..dim];
-            let (panel, column) = (panel_base + local / PANEL, local % PANEL);
-            let lines = &mut packed.quads[panel * depth * 2..][..depth * 2];
-            for (pair, quad) in lines.chunks_exact_mut(2).zip(codes.chunks(4)) {
-                for (slot, &code) in pair[column / LANES].0[column % LANES * 4..]
-                    .iter_mut()
-                    .zip(quad)
-                {
-                    *slot = code as u8 ^ OFFSET;
-                }
+        .resize(panels * groups, [CacheLine([OFFSET; 64]); 2]);
+    for_each_column(columns, PANEL, |panel, column, codes| {
+        let lines = &mut packed.quads[panel * groups..][..groups];
+        for (lines, quad) in lines.iter_mut().zip(codes.chunks(4)) {
+            let places = &mut lines[column / LANES].0[column % LANES * 4..];
+            for (place, &code) in places.iter_mut().zip(quad) {
+                *place = code.cast_unsigned() ^ OFFSET;
             }
         }
-        panel_base += columns.counts[section].div_ceil(PANEL);
-    }
+    });
 }
 
-/// Sums of the rows, from which follows what the offset of the columns adds to a product; and the
-/// rows padded to whole fours, if need be.
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni")]
-fn lay_out(rows: Quantised<'_>, scratch: &mut Scratch) {
-    scratch.starts.clear();
-    scratch.starts.extend(
-        rows.codes
-            .chunks_exact(rows.dim)
-            .map(|row| -i32::from(OFFSET) * sum(row)),
-    );
-    scratch.padded.clear();
-    if !rows.dim.is_multiple_of(4) {
-        for row in rows.codes.chunks_exact(rows.dim) {
-            scratch.padded.extend_from_slice(row);
-            scratch
-                .padded
-                .resize(scratch.padded.len().next_multiple_of(4), 0);
-        }
-    }
-}
-
-/// The sum of a row's codes: its product with ones.
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni")]
-fn sum(row: &[i8]) -> i32 {
-    let (whole, rest) = row.as_chunks::<64>();
-    let ones = _mm512_set1_epi8(1);
-    let add = |sums, codes: &[i8; 64]| {
-        // SAFETY: the array holds 64 bytes, and this function has the instructions.
-        unsafe { _mm512_dpbusd_epi32(sums, ones, _mm512_loadu_si512(codes.as_ptr().cast())) }
-    };
-    _mm512_reduce_add_epi32(whole.iter().fold(_mm512_setzero_si512(), add))
-        + rest.iter().map(|&code| i32::from(code)).sum::<i32>()
-}
-
-/// See [`super::block_maxima`], which has checked the lengths.
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni")]
+/// See [`super::block_maxima`].
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni,popcnt")]
 pub(super) fn block_maxima(
     columns: &PackedColumns,
-    rows: Quantised<'_>,
+    rows: Int8Descriptors<'_>,
     wanted: &Blocks,
     scratch: &mut Scratch,
     out: &mut BlockMaxima,
 ) {
-    // SAFETY: this function has the level's instructions.
-    unsafe { driver::block_maxima::<Avx512, TILE, STEP>(columns, rows, wanted, scratch, out) }
+    panels::block_maxima::<_, TILE, STEP>(Avx512Isa::new(), columns, rows, wanted, scratch, out);
 }
 
-struct Avx512;
-
-impl Level for Avx512 {
-    type Code = i8;
-    type Line = Line<u8, 64>;
-    type Floats = lanes::Avx512;
+impl SimilarityIsa for Avx512Isa {
+    type RowGroup = [i8; 4];
+    type PanelGroup = [CacheLine<u8, 64>; 2];
     type Integers = __m512i;
 
+    /// Sums the codes of each row, and fills rows up with zeros to whole groups if they are not.
     #[inline(always)]
-    unsafe fn lay_out(rows: Quantised<'_>, scratch: &mut Scratch) {
-        // SAFETY: the caller vouches for AVX-512.
-        unsafe { lay_out(rows, scratch) }
-    }
-
-    #[inline(always)]
-    fn rows<'a>(rows: Quantised<'a>, scratch: &'a Scratch) -> &'a [i8] {
+    fn lay_out(self, rows: Int8Descriptors<'_>, scratch: &mut Scratch) {
+        // SAFETY: `self` proves that the CPU has AVX-512 with VNNI.
+        unsafe { start_sums(rows, &mut scratch.starts) };
+        scratch.quads.clear();
         if rows.dim.is_multiple_of(4) {
-            rows.codes
-        } else {
-            &scratch.padded
+            return;
+        }
+        let groups = Self::groups(rows.dim);
+        scratch.quads.resize(rows.len() * groups, [0; 4]);
+        let places = scratch.quads.chunks_exact_mut(groups);
+        for (row, quads) in rows.codes.chunks_exact(rows.dim).zip(places) {
+            quads.as_flattened_mut()[..rows.dim].copy_from_slice(row);
         }
     }
 
     #[inline(always)]
-    fn lines(columns: &PackedColumns) -> &[Self::Line] {
+    fn rows<'a>(rows: Int8Descriptors<'a>, scratch: &'a Scratch) -> &'a [[i8; 4]] {
+        if rows.dim.is_multiple_of(4) {
+            let (quads, _) = rows.codes.as_chunks();
+            quads
+        } else {
+            &scratch.quads
+        }
+    }
+
+    #[inline(always)]
+    fn panels(columns: &PackedColumns) -> &[[CacheLine<u8, 64>; 2]] {
         &columns.quads
     }
 
     #[inline(always)]
-    fn lines_per_panel(dim: usize) -> usize {
-        dim.div_ceil(4) * 2
+    fn groups(dim: usize) -> usize {
+        dim.div_ceil(4)
     }
 
     #[inline(always)]
-    unsafe fn start(scratch: &Scratch, row: usize) -> __m512i {
-        // SAFETY: the caller vouches for AVX-512.
-        unsafe { _mm512_set1_epi32(scratch.starts[row]) }
+    fn start(self, scratch: &Scratch, row: usize) -> __m512i {
+        self.splat_index(scratch.starts[row])
     }
 
     #[inline(always)]
-    unsafe fn add_products<const ROWS: usize, const VECTORS: usize>(
-        rows: *const i8,
-        panel: &[Self::Line],
-        sums: &mut [[__m512i; VECTORS]; ROWS],
-    ) {
-        const { assert!(ROWS <= TILE && VECTORS <= 2) };
-        let stride = 2 * panel.len();
-        for (k, lines) in panel.chunks_exact(2).enumerate() {
-            // SAFETY: a line holds 64 bytes; row `r` has bytes up to `stride`, and 4k + 3 < stride.
-            unsafe {
-                // Written out: with a loop over rows the compiler keeps the sums in memory.
-                macro_rules! rows {
-                    ($($r:literal)*) => {$(
-                        if $r < ROWS {
-                            let quad = _mm512_set1_epi32(rows.add($r * stride + 4 * k).cast::<i32>().read_unaligned());
-                            for vector in 0..VECTORS {
-                                let column = _mm512_load_si512(lines[vector].0.as_ptr().cast());
-                                sums[$r][vector] = _mm512_dpbusd_epi32(sums[$r][vector], column, quad);
-                            }
-                        }
-                    )*};
-                }
-                rows!(0 1 2 3 4 5 6 7 8 9 10 11);
-            }
-        }
+    fn broadcast(self, group: [i8; 4]) -> __m512i {
+        self.splat_index(bytemuck::cast(group))
     }
 
     #[inline(always)]
-    unsafe fn to_floats(sums: __m512i) -> lanes::Avx512 {
-        // SAFETY: the caller vouches for AVX-512.
-        lanes::Avx512(unsafe { _mm512_cvtepi32_ps(sums) })
+    fn column(self, group: &[CacheLine<u8, 64>; 2], vector: usize) -> __m512i {
+        let line = &group[vector];
+        // SAFETY: the line holds the 64 bytes read and is aligned to as many; `self` proves that
+        // the CPU has AVX-512.
+        unsafe { _mm512_load_si512(line.0.as_ptr().cast()) }
     }
 
     #[inline(always)]
-    unsafe fn splat_index(index: i32) -> __m512i {
-        // SAFETY: the caller vouches for AVX-512.
+    fn add_products(self, sums: __m512i, columns: __m512i, row: __m512i) -> __m512i {
+        // SAFETY: `self` proves that the CPU has AVX-512 VNNI.
+        unsafe { _mm512_dpbusd_epi32(sums, columns, row) }
+    }
+
+    #[inline(always)]
+    fn to_floats(self, sums: __m512i) -> Avx512Floats {
+        // SAFETY: `self` proves that the CPU has AVX-512.
+        Avx512Floats::new(self, unsafe { _mm512_cvtepi32_ps(sums) })
+    }
+
+    #[inline(always)]
+    fn splat_index(self, index: i32) -> __m512i {
+        // SAFETY: `self` proves that the CPU has AVX-512.
         unsafe { _mm512_set1_epi32(index) }
     }
 
     #[inline(always)]
-    unsafe fn indices_from(first: i32) -> __m512i {
-        // SAFETY: the caller vouches for AVX-512.
-        unsafe {
-            let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-            _mm512_add_epi32(_mm512_set1_epi32(first), lane)
+    fn indices_from(self, first: i32) -> __m512i {
+        // SAFETY: `self` proves that the CPU has AVX-512.
+        unsafe { indices_from(first) }
+    }
+
+    #[inline(always)]
+    fn load_indices(self, from: &[i32]) -> __m512i {
+        let from: &[i32; 16] = first(from);
+        // SAFETY: the array holds the 64 bytes read, at any address; `self` proves that the CPU has
+        // AVX-512.
+        unsafe { _mm512_loadu_si512(from.as_ptr().cast()) }
+    }
+
+    #[inline(always)]
+    fn store_indices(self, indices: __m512i, to: &mut [i32]) {
+        let to: &mut [i32; 16] = first_mut(to);
+        // SAFETY: the array has room for the 64 bytes written, at any address; `self` proves that
+        // the CPU has AVX-512.
+        unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), indices) }
+    }
+
+    #[inline(always)]
+    fn better(self, current: LaneBests<Self>, challenger: LaneBests<Self>) -> LaneBests<Self> {
+        let current_values = current.values.register();
+        let values = challenger.values.register();
+        // SAFETY: `self` proves that the CPU has AVX-512.
+        let (values, indices) =
+            unsafe { better(current_values, current.indices, values, challenger.indices) };
+        LaneBests {
+            values: Avx512Floats::new(self, values),
+            indices,
         }
     }
+}
 
-    #[inline(always)]
-    unsafe fn load_indices(from: *const i32) -> __m512i {
-        // SAFETY: the caller vouches for AVX-512 and sixteen elements.
-        unsafe { _mm512_loadu_si512(from.cast()) }
+/// What the sums of each row start from, so that the offset of the columns cancels out.
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni,popcnt")]
+fn start_sums(rows: Int8Descriptors<'_>, starts: &mut Vec<i32>) {
+    starts.clear();
+    for row in rows.codes.chunks_exact(rows.dim) {
+        starts.push(-i32::from(OFFSET) * sum(row));
     }
+}
 
-    #[inline(always)]
-    unsafe fn store_indices(to: *mut i32, indices: __m512i) {
-        // SAFETY: the caller vouches for AVX-512 and sixteen elements.
-        unsafe { _mm512_storeu_si512(to.cast(), indices) }
+/// The sum of a row's codes: its product with ones.
+#[inline]
+#[target_feature(enable = "avx512f,avx512vnni")]
+fn sum(row: &[i8]) -> i32 {
+    let (whole, rest) = row.as_chunks::<64>();
+    let ones = _mm512_set1_epi8(1);
+    let mut sums = _mm512_setzero_si512();
+    for codes in whole {
+        // SAFETY: the array holds the 64 bytes read, at any address.
+        let codes = unsafe { _mm512_loadu_si512(codes.as_ptr().cast()) };
+        sums = _mm512_dpbusd_epi32(sums, ones, codes);
     }
+    let of_rest: i32 = rest.iter().map(|&code| i32::from(code)).sum();
+    _mm512_reduce_add_epi32(sums) + of_rest
+}
 
-    #[inline(always)]
-    unsafe fn challenge(
-        value: &mut lanes::Avx512,
-        index: &mut __m512i,
-        new_value: lanes::Avx512,
-        new_index: __m512i,
-    ) {
-        // SAFETY: the caller vouches for AVX-512.
-        unsafe {
-            let better = _mm512_cmp_ps_mask::<_CMP_GT_OQ>(new_value.0, value.0);
-            value.0 = _mm512_mask_mov_ps(value.0, better, new_value.0);
-            *index = _mm512_mask_mov_epi32(*index, better, new_index);
-        }
-    }
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn indices_from(first: i32) -> __m512i {
+    let lanes = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    _mm512_add_epi32(_mm512_set1_epi32(first), lanes)
+}
+
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn better(
+    current_values: __m512,
+    current_indices: __m512i,
+    values: __m512,
+    indices: __m512i,
+) -> (__m512, __m512i) {
+    let is_better = _mm512_cmp_ps_mask::<_CMP_GT_OQ>(values, current_values);
+    let values = _mm512_mask_mov_ps(current_values, is_better, values);
+    let indices = _mm512_mask_mov_epi32(current_indices, is_better, indices);
+    (values, indices)
 }

@@ -7,7 +7,9 @@
 
 use placeformer_core::types::{PackedPatches, SCALES, ScaleSet};
 use placeformer_kernels::Simd;
-use placeformer_kernels::similarity::{self, Best, BlockMaxima, Blocks, PackedColumns, Quantised};
+use placeformer_kernels::similarity::{
+    self, Best, BlockMaxima, Blocks, Int8Descriptors, PackedColumns,
+};
 
 /// A mutual pair: row in the query's patches, row in the reference's.
 pub(super) type Pair = (u32, u32);
@@ -54,8 +56,8 @@ pub(super) fn centres_of(patches: &PackedPatches, out: &mut Vec<[f32; 2]>) {
     }
 }
 
-fn quantised(patches: &PackedPatches) -> Quantised<'_> {
-    Quantised {
+fn quantised(patches: &PackedPatches) -> Int8Descriptors<'_> {
+    Int8Descriptors {
         dim: patches.dim,
         counts: patches.counts,
         codes: &patches.codes,

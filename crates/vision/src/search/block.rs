@@ -3,7 +3,7 @@
 use super::IndexEntry;
 use super::filter::{Extent, PlaceAndTime};
 use placeformer_core::types::{GLOBAL_DIM, ReferenceId};
-use placeformer_kernels::scan::{Codes, LENGTH, Rows};
+use placeformer_kernels::scan::{Codes, LENGTH, ScanRows};
 use placeformer_kernels::{quantise, simd};
 
 const _: () = assert!(LENGTH == GLOBAL_DIM);
@@ -85,7 +85,7 @@ impl Block {
     }
 
     /// What a scan reads.
-    pub(super) fn rows(&self) -> Rows<'_> {
+    pub(super) fn rows(&self) -> ScanRows<'_> {
         let Self {
             codes,
             scales,
@@ -94,7 +94,7 @@ impl Block {
             longest,
             ..
         } = self;
-        Rows {
+        ScanRows {
             codes,
             scales,
             errors,

@@ -33,7 +33,7 @@ use super::Neighbour;
 use super::block::{Block, Quantised, Sealed};
 use super::filter::Sieve;
 use placeformer_core::types::ReferenceId;
-use placeformer_kernels::scan::{Bounds, GROUP, Probe, bounds, dot_products, next_near};
+use placeformer_kernels::scan::{Bounds, GROUP, ScanQuery, bounds, dot_products, next_near};
 use placeformer_kernels::{Simd, simd};
 use std::cell::RefCell;
 use std::collections::BinaryHeap;
@@ -65,7 +65,7 @@ pub(super) fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
 /// A query, prepared once.
 pub(super) struct Query<'a> {
     vector: &'a [f32],
-    probe: Probe,
+    probe: ScanQuery,
     k: usize,
     sieve: Sieve,
     simd: Simd,
@@ -83,7 +83,7 @@ impl<'a> Query<'a> {
             square,
         } = Quantised::new(vector);
         let length = square.sqrt() * (1.0 + 1e-6);
-        let probe = Probe {
+        let probe = ScanQuery {
             codes,
             scale,
             square,

@@ -6,13 +6,14 @@ use crate::extract::preset::LAYER_NORM_EPS;
 use placeformer_kernels::Simd;
 use placeformer_kernels::aligned::AlignedBuffer;
 use placeformer_kernels::attention::{
-    AttentionShape, Place, attend, store_key_codes, store_keys, store_query_codes, store_values,
+    AttentionShape, BlockPosition, attend, store_key_codes, store_keys, store_query_codes,
+    store_values,
 };
 use placeformer_kernels::elementwise::{
     Epilogue, Product, finish_block, finish_words, normalize_rows,
 };
 use placeformer_kernels::gemm::{Tiling, multiply_panel};
-use placeformer_kernels::operand::{Format, Left, OperandBuffer, Rows};
+use placeformer_kernels::operand::{Format, LeftOperand, OperandBuffer, WordRows};
 use std::ops::Range;
 
 /// Width of the slice of the MLP's hidden layer that exists at a time.
@@ -150,7 +151,7 @@ impl ChunkPlan {
         self.linear(rows, left, &block.qkv, sums, |panel, token, product| {
             let (simd, shape) = (self.simd, &self.shape);
             let (part, column) = (panel * columns / self.dim, panel * columns % self.dim);
-            let place = Place {
+            let place = BlockPosition {
                 head: column / head_dim,
                 dim: column % head_dim,
                 token,
@@ -186,7 +187,7 @@ impl ChunkPlan {
             let stride = format.words(columns);
             let finished = packed_block.rows(format, product.rows, columns);
             finish_words(simd, format, Epilogue::Bias, product, finished, stride);
-            let finished = Rows {
+            let finished = WordRows {
                 data: finished,
                 stride,
             };
@@ -308,8 +309,8 @@ impl ChunkPlan {
                         finish_words(simd, format, gelu, product, out, words);
                     },
                 );
-                Left {
-                    rows: Rows {
+                LeftOperand {
+                    rows: WordRows {
                         data: finished,
                         stride: words,
                     },
@@ -354,7 +355,7 @@ impl ChunkPlan {
         rows: usize,
         input: &'a [f32],
         packed: &'a mut OperandBuffer,
-    ) -> Left<'a> {
+    ) -> LeftOperand<'a> {
         let (format, channels) = (layer.weight.format(), layer.channels(0..self.dim));
         packed.pack_scaled(
             self.simd,
@@ -371,7 +372,7 @@ impl ChunkPlan {
     fn linear(
         &self,
         rows: usize,
-        left: Left<'_>,
+        left: LeftOperand<'_>,
         layer: &PackedLinear,
         sums: &mut AlignedBuffer<f32>,
         finish: impl FnMut(usize, usize, Product<'_>),
@@ -389,7 +390,7 @@ impl ChunkPlan {
     /// The given panels of a slice of a layer.
     fn panels(
         &self,
-        (rows, left): (usize, Left<'_>),
+        (rows, left): (usize, LeftOperand<'_>),
         layer: &PackedLinear,
         slice: usize,
         panels: Range<usize>,

@@ -34,7 +34,7 @@ use placeformer_core::types::{ImageTensor, InvalidValue};
 use placeformer_kernels::aligned::AlignedBuffer;
 use placeformer_kernels::attention::{AttentionShape, chunk_rows, first_row_attention};
 use placeformer_kernels::elementwise::normalize_rows;
-use placeformer_kernels::gemm::{Readiness, Tiling};
+use placeformer_kernels::gemm::{MatrixUnitGuard, Tiling};
 use placeformer_kernels::operand::Format;
 use placeformer_kernels::{Simd, SimdLevel};
 use rayon::prelude::*;
@@ -278,7 +278,7 @@ impl FusedEncoder {
                     keys,
                     values,
                 };
-                let _ready = Readiness::new(plan.simd);
+                let _ready = MatrixUnitGuard::new(plan.simd);
                 self.scratches
                     .with(|scratch| task(image, &mut chunk, current, scratch));
             });
@@ -405,7 +405,7 @@ impl FusedEncoder {
         let keys = &work.keys[image * keys_len..(image + 1) * keys_len];
         work.scores.resize(shape.scratch_len(simd) + shape.tokens);
         let (row, scratch) = work.scores.split_at_mut(shape.tokens);
-        let _ready = Readiness::new(simd);
+        let _ready = MatrixUnitGuard::new(simd);
         for head in 0..shape.heads {
             first_row_attention(simd, shape, head, queries, keys, scratch, row);
             out.cls_attention.extend_from_slice(&row[1..]);

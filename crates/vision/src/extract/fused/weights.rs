@@ -13,7 +13,7 @@ use super::spread::{BlockSpread, Spread};
 use crate::extract::weights::{BlockWeights, Linear, Norm};
 use placeformer_kernels::Simd;
 use placeformer_kernels::gemm::{PackedMatrix, Tiling};
-use placeformer_kernels::operand::{Channels, Format};
+use placeformer_kernels::operand::{ChannelScaling, Format};
 use std::ops::Range;
 
 /// A linear layer, packed.
@@ -90,11 +90,11 @@ impl PackedLinear {
     }
 
     /// How the inputs in `range` are scaled before they become codes.
-    pub fn channels(&self, range: Range<usize>) -> Channels<'_> {
+    pub fn channels(&self, range: Range<usize>) -> ChannelScaling<'_> {
         if self.gain.is_empty() {
-            return Channels::default();
+            return ChannelScaling::default();
         }
-        Channels {
+        ChannelScaling {
             gain: &self.gain[range.clone()],
             shift: &self.shift[range],
         }
