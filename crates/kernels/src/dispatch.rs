@@ -25,7 +25,8 @@ macro_rules! dispatch {
             #[cfg(target_arch = "x86_64")]
             $crate::SimdLevel::Avx512 => {
                 // SAFETY: a token of this level exists only where the CPU has AVX-512 F, BW, DQ,
-                // VL and VNNI, which are all that functions in `avx512` modules are compiled for.
+                // VL and VNNI on top of what AVX2 modules need, which are all that
+                // functions in `avx512` modules are compiled for.
                 unsafe { avx512::$kernel($($argument),*) }
             }
             #[cfg(target_arch = "x86_64")]

@@ -6,40 +6,47 @@ use crate::gemm::Tiling;
 use crate::operand::Format;
 use crate::testing::{differ, ramp};
 
-/// LayerNorm, softmax and the epilogues against the definition in f64, on odd sizes.
+/// Compares a level with the definitions, on odd sizes.
 pub(crate) fn check(simd: Simd) -> Result<(), String> {
     for len in [1, 7, 16, 45] {
         let row: Vec<f32> = ramp(len, 5).iter().map(|value| value * 30.0).collect();
-        let mut normed = vec![0.0; len];
-        normalize_rows(simd, len, 1e-6, &row, &mut normed);
-        let mean = row.iter().map(|&x| f64::from(x)).sum::<f64>() / len as f64;
-        let variance = row
-            .iter()
-            .map(|&x| (f64::from(x) - mean).powi(2))
-            .sum::<f64>()
-            / len as f64;
-        let mut scores = row.clone();
-        let reciprocal = exponentiate_row(simd, Format::F32, &mut scores);
-        let highest = row.iter().copied().fold(f32::MIN, f32::max);
-        let total: f64 = row.iter().map(|&x| f64::from(x - highest).exp2()).sum();
-        for (index, &x) in row.iter().enumerate() {
-            let expected = (f64::from(x) - mean) / (variance + 1e-6).sqrt();
-            if differ(normed[index], expected, 1e-4) {
-                return Err(format!(
-                    "LayerNorm of {len}: {} is not {expected}",
-                    normed[index]
-                ));
-            }
-            let expected = f64::from(x - highest).exp2() / total;
-            if differ(scores[index] * reciprocal, expected, 1e-6) {
-                return Err(format!(
-                    "softmax of {len}: {} is not {expected}",
-                    scores[index] * reciprocal
-                ));
-            }
-        }
+        check_layer_norm(simd, &row)?;
+        check_softmax(simd, &row)?;
     }
     check_epilogues(simd)
+}
+
+fn check_layer_norm(simd: Simd, row: &[f32]) -> Result<(), String> {
+    let len = row.len();
+    let mut normed = vec![0.0; len];
+    normalize_rows(simd, len, 1e-6, row, &mut normed);
+    let sum: f64 = row.iter().map(|&x| f64::from(x)).sum();
+    let mean = sum / len as f64;
+    let squares: f64 = row.iter().map(|&x| (f64::from(x) - mean).powi(2)).sum();
+    let variance = squares / len as f64;
+    for (&x, &actual) in row.iter().zip(&normed) {
+        let expected = (f64::from(x) - mean) / (variance + 1e-6).sqrt();
+        if differ(actual, expected, 1e-4) {
+            return Err(format!("LayerNorm of {len}: {actual} is not {expected}"));
+        }
+    }
+    Ok(())
+}
+
+fn check_softmax(simd: Simd, row: &[f32]) -> Result<(), String> {
+    let len = row.len();
+    let mut scores = row.to_vec();
+    let reciprocal = exponentiate_row(simd, Format::F32, &mut scores);
+    let highest = row.iter().copied().fold(f32::MIN, f32::max);
+    let total: f64 = row.iter().map(|&x| f64::from(x - highest).exp2()).sum();
+    for (&x, &score) in row.iter().zip(&scores) {
+        let actual = score * reciprocal;
+        let expected = f64::from(x - highest).exp2() / total;
+        if differ(actual, expected, 1e-6) {
+            return Err(format!("softmax of {len}: {actual} is not {expected}"));
+        }
+    }
+    Ok(())
 }
 
 fn check_epilogues(simd: Simd) -> Result<(), String> {
