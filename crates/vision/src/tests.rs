@@ -117,8 +117,8 @@ fn int8_mutual_pairs(
         .collect()
 }
 
-/// Mutual nearest neighbours as the paper defines them (III-D): f32 descriptors, Euclidean distance,
-/// the lowest index of several that are equally near.
+/// Mutual nearest neighbours as the paper defines them (III-D): f32 descriptors, Euclidean
+/// distance, the lowest index of several that are equally near.
 fn plain_mutual_pairs(query: &[f32], reference: &[f32], dim: usize) -> Vec<[usize; 2]> {
     let query: Vec<&[f32]> = query.chunks_exact(dim).collect();
     let reference: Vec<&[f32]> = reference.chunks_exact(dim).collect();

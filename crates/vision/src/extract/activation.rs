@@ -2,8 +2,8 @@
 //!
 //! The models are trained with this form, not with the tanh approximation. A scalar `erff` from a
 //! math library would take a tenth of a whole forward pass. Here the error function is a rational
-//! function of x, clamped to -4..4; without branches the compiler turns it into vector code, and its
-//! cost no longer matters.
+//! function of x, clamped to -4..4; without branches the compiler turns it into vector code, and
+//! its cost no longer matters.
 
 /// x / 2 * (1 + erf(x / sqrt 2)), in place.
 pub fn gelu(values: &mut [f32]) {

@@ -16,8 +16,8 @@ use std::str::FromStr;
 pub struct ExtractConfig {
     /// The backbone.
     pub preset: Preset,
-    /// A weights file for the preset's geometry. Unless set, the preset's published weights are used,
-    /// and downloaded on first use.
+    /// A weights file for the preset's geometry. Unless set, the preset's published weights are
+    /// used, and downloaded on first use.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub weights: Option<PathBuf>,
     /// Size in pixels to which images are resized; each side a multiple of the patch size.
@@ -29,15 +29,16 @@ pub struct ExtractConfig {
     /// Whether the tokens pass the final LayerNorm.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub token_norm: Option<bool>,
-    /// Number, from 0, of the block whose CLS attention ranks the patches; the exit block unless set.
+    /// Number, from 0, of the block whose CLS attention ranks the patches; the exit block unless
+    /// set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub attention_block: Option<usize>,
     /// Number of attention heads, for weights that were trained with another number than the preset
     /// has. It cannot be seen from the shape of any tensor.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub heads: Option<usize>,
-    /// Key patches must exceed this multiple of the uniform attention heads/n; 1 is the paper's 0.01
-    /// (III-C).
+    /// Key patches must exceed this multiple of the uniform attention heads/n; 1 is the paper's
+    /// 0.01 (III-C).
     pub tau: f32,
     /// Most key patches at scales 1, 2 and 3 (paper III-C).
     pub caps: [usize; SCALES],
@@ -75,8 +76,8 @@ pub enum HeadChoice {
     /// The one built in for this backbone; it is an error if there is none.
     #[default]
     Default,
-    /// None: the global descriptor is the pooled vector itself, as long as the backbone makes it. For
-    /// evaluation and for fitting heads; such descriptors cannot be searched.
+    /// None: the global descriptor is the pooled vector itself, as long as the backbone makes it.
+    /// For evaluation and for fitting heads; such descriptors cannot be searched.
     None,
     /// A head file.
     File(PathBuf),

@@ -1,7 +1,7 @@
 //! The interface between the transformer and everything after it.
 //!
-//! How the transformer is computed (in which precision, by which implementation) is chosen at start;
-//! what comes after it only sees [`Encoder`] and [`EncodedImage`].
+//! How the transformer is computed (in which precision, by which implementation) is chosen at
+//! start; what comes after it only sees [`Encoder`] and [`EncodedImage`].
 
 use super::error::ExtractError;
 use super::preset::Geometry;
@@ -61,13 +61,13 @@ pub struct EncodedImage {
     pub dim: usize,
     /// Number of attention heads.
     pub heads: usize,
-    /// Patch tokens after the exit block, and after the final LayerNorm if the spec asks for it, `[n,
-    /// dim]`.
+    /// Patch tokens after the exit block, and after the final LayerNorm if the spec asks for it,
+    /// `[n, dim]`.
     pub tokens: Vec<f32>,
     /// The CLS token at the same point, `[dim]`.
     pub cls_token: Vec<f32>,
-    /// Softmax attention of the CLS query in the attention block, `[heads, n]`. The weight of the CLS
-    /// key itself is left out, and the others are not renormalised.
+    /// Softmax attention of the CLS query in the attention block, `[heads, n]`. The weight of the
+    /// CLS key itself is left out, and the others are not renormalised.
     pub cls_attention: Vec<f32>,
 }
 
@@ -93,8 +93,8 @@ pub trait Encoder: Send + Sync {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// The fastest one with which recall after re-ranking is as good as with f32: mixed on CPUs that
-    /// multiply int8 vectors, f32 on others.
+    /// The fastest one with which recall after re-ranking is as good as with f32: mixed on CPUs
+    /// that multiply int8 vectors, f32 on others.
     #[default]
     Auto,
     /// 32-bit floats.
@@ -145,8 +145,8 @@ impl FromStr for Precision {
 /// Checks that an image has the size that the spec asks for.
 ///
 /// # Errors
-/// [`ExtractError::WrongSize`] for another size; [`ExtractError::WrongLength`] if the tensor does not
-/// hold three planes of its stated size.
+/// [`ExtractError::WrongSize`] for another size; [`ExtractError::WrongLength`] if the tensor does
+/// not hold three planes of its stated size.
 pub fn check_image(image: &ImageTensor, spec: &EncoderSpec) -> Result<(), ExtractError> {
     if image.size != spec.input_size {
         return Err(ExtractError::WrongSize {

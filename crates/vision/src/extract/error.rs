@@ -38,7 +38,10 @@ pub enum ExtractError {
         problems: Vec<String>,
     },
     /// The bytes of a file are not those that were downloaded.
-    #[error("{}: SHA-256 is {actual}, expected {expected}; delete the file and pull the model again", path.display())]
+    #[error(
+        "{}: SHA-256 is {actual}, expected {expected}; delete the file and pull the model again",
+        path.display()
+    )]
     HashMismatch {
         /// The file.
         path: PathBuf,

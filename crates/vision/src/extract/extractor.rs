@@ -76,8 +76,8 @@ impl Extractor {
         })
     }
 
-    /// The same model, computed by another encoder; for example by the plain one, with which the fused
-    /// one is compared.
+    /// The same model, computed by another encoder; for example by the plain one, with which the
+    /// fused one is compared.
     ///
     /// # Errors
     /// [`ExtractError::Config`] if the encoder computes something else than the settings say.
@@ -145,11 +145,11 @@ impl Extractor {
     /// # Errors
     /// An image of another size than [`Extractor::input_size`], or an output that is not finite.
     pub fn extract(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
-        let described = self.extract_full(images)?;
-        Ok(described
-            .into_iter()
-            .map(|(descriptor, _)| descriptor)
-            .collect())
+        let encoded = self.encoder.encode(images)?;
+        encoded
+            .iter()
+            .map(|image| self.describe(image).map(|(descriptor, _)| descriptor))
+            .collect()
     }
 
     /// As [`Extractor::extract`], with the key patches in full precision too, for measuring what
@@ -165,7 +165,8 @@ impl Extractor {
         encoded.iter().map(|image| self.describe(image)).collect()
     }
 
-    /// The pooled tokens of each image, by the head's own aggregate: all that training a head needs.
+    /// The pooled tokens of each image, by the head's own aggregate: all that training a head
+    /// needs.
     ///
     /// # Errors
     /// As [`Extractor::extract`].
@@ -225,8 +226,8 @@ impl Extractor {
         })
     }
 
-    /// Encodes an artificial image, so that the first request does not have to wait for page faults and
-    /// starting threads.
+    /// Encodes an artificial image, so that the first request does not have to wait for page faults
+    /// and starting threads.
     ///
     /// # Errors
     /// As [`Extractor::extract`], if the model does not work at all.

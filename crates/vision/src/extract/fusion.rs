@@ -1,4 +1,5 @@
-//! Multi-scale patches: tokens and attention, average-pooled over 2x2 and 3x3 windows (paper III-B).
+//! Multi-scale patches: tokens and attention, average-pooled over 2x2 and 3x3 windows (paper
+//! III-B).
 
 use placeformer_core::types::PatchGrid;
 

@@ -25,8 +25,9 @@ const HEAD_MARK: &str = ":h";
 /// Hexadecimal digits of a hash that are part of an identity.
 const HASH_DIGITS: usize = 12;
 
-/// The part of the identity that tokens depend on: preset, weights, number of heads if it is not the
-/// preset's, exit block, and `n` if tokens pass the final LayerNorm. A head depends on exactly this.
+/// The part of the identity that tokens depend on: preset, weights, number of heads if it is not
+/// the preset's, exit block, and `n` if tokens pass the final LayerNorm. A head depends on exactly
+/// this.
 pub(super) fn backbone_id(
     config: &ExtractConfig,
     spec: &EncoderSpec,

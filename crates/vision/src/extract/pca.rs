@@ -271,8 +271,8 @@ mod tests {
             .unwrap();
         let few =
             half_whitened_head_of_few(&vectors, Aggregate::Mean, "x", BTreeMap::new()).unwrap();
-        // The weak components have nearly equal variances, so rounding may mix them. The strong ones
-        // differ clearly and must agree.
+        // The weak components have nearly equal variances, so rounding may mix them. The strong
+        // ones differ clearly and must agree.
         for vector in &vectors[..20] {
             let a = direct.affine(vector);
             let b = few.affine(vector);

@@ -118,8 +118,8 @@ impl Preset {
         }
     }
 
-    /// The input size in pixels, unless another is set: 640x480 as in the paper, and 448x336 for stock
-    /// weights, which gain nothing from larger images.
+    /// The input size in pixels, unless another is set: 640x480 as in the paper, and 448x336 for
+    /// stock weights, which gain nothing from larger images.
     pub fn input_size(self) -> ImageSize {
         match self {
             Self::PlaceformerVits16 => ImageSize {
@@ -133,8 +133,8 @@ impl Preset {
         }
     }
 
-    /// Number, from 0, of the block after which tokens are taken: three quarters of the way for stock
-    /// weights, the last block for weights that were trained for place recognition.
+    /// Number, from 0, of the block after which tokens are taken: three quarters of the way for
+    /// stock weights, the last block for weights that were trained for place recognition.
     pub fn exit_block(self) -> usize {
         match self {
             Self::PlaceformerVits16 => self.geometry().depth - 1,
@@ -158,8 +158,8 @@ impl Preset {
     }
 
     /// The [content hash](crate::extract::VitWeights::content_hash) that its published weights must
-    /// have. Only the default preset has one: its built-in head and calibration were fitted to exactly
-    /// these weights.
+    /// have. Only the default preset has one: its built-in head and calibration were fitted to
+    /// exactly these weights.
     pub fn content_sha256(self) -> Option<&'static str> {
         match self {
             Self::Dinov2Vits14 => {
@@ -169,11 +169,11 @@ impl Preset {
         }
     }
 
-    /// Rows and columns of a learned position table with this many entries (CLS not counted), if the
-    /// preset can have such a table.
+    /// Rows and columns of a learned position table with this many entries (CLS not counted), if
+    /// the preset can have such a table.
     ///
-    /// DINOv2 has 37x37. The paper's backbone may have any square, as pre-trained on ImageNet, or the
-    /// grid of its own input size, after training.
+    /// DINOv2 has 37x37. The paper's backbone may have any square, as pre-trained on ImageNet, or
+    /// the grid of its own input size, after training.
     pub fn position_grid(self, entries: usize) -> Option<(usize, usize)> {
         let side = entries.isqrt();
         let (columns, rows) = self.geometry().grid(self.input_size());

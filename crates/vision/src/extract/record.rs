@@ -1,7 +1,7 @@
 //! Where a downloaded weights file came from, and which SHA-256 it must have.
 //!
-//! The record of `<file>` is the JSON file `<file>.json` next to it. Weights that a user brings have
-//! no record; of those only the names and shapes of the tensors are checked.
+//! The record of `<file>` is the JSON file `<file>.json` next to it. Weights that a user brings
+//! have no record; of those only the names and shapes of the tensors are checked.
 
 use super::error::ExtractError;
 use placeformer_core::files::{hash_file, with_suffix, write_atomically};

@@ -21,8 +21,8 @@ pub fn select(attention: &[f32], cap: usize, tau: f32) -> Vec<u32> {
 
 /// Key patches of all three scales, from tokens `[n, dim]` and CLS attention `[heads, n]`.
 ///
-/// At each scale at most `caps[scale - 1]` patches are chosen, and only such whose attention exceeds
-/// `tau` times the uniform level. Their descriptors are L2-normalised.
+/// At each scale at most `caps[scale - 1]` patches are chosen, and only such whose attention
+/// exceeds `tau` times the uniform level. Their descriptors are L2-normalised.
 pub fn key_patches(
     tokens: &[f32],
     cls_attention: &[f32],

@@ -82,8 +82,8 @@ struct Pass {
 }
 
 impl CandleEncoder {
-    /// Copies the weights of the blocks that `spec` needs, and interpolates the positions to the grid
-    /// of its input size.
+    /// Copies the weights of the blocks that `spec` needs, and interpolates the positions to the
+    /// grid of its input size.
     ///
     /// # Errors
     /// Those of candle.
@@ -182,7 +182,8 @@ impl CandleEncoder {
         Tensor::cat(&[&self.cls, &embedded], 0)
     }
 
-    /// The pixels of each patch in the order channel, row, column; patches row by row: `[n, 3 p p]`.
+    /// The pixels of each patch in the order channel, row, column; patches row by row: `[n, 3 p
+    /// p]`.
     fn patches(&self, image: &ImageTensor) -> Vec<f32> {
         let patch = self.geometry.patch;
         let width = image.size.width as usize;
@@ -267,8 +268,8 @@ impl Block {
         self.qkv.values() + self.proj.values() + self.fc1.values() + self.fc2.values()
     }
 
-    /// The block's output `[1 + n, d]` and its CLS attention `[heads, n]`; `record` gets the inputs of
-    /// its linear layers.
+    /// The block's output `[1 + n, d]` and its CLS attention `[heads, n]`; `record` gets the inputs
+    /// of its linear layers.
     fn forward(
         &self,
         x: &Tensor,
@@ -303,8 +304,8 @@ impl Block {
         patch_keys(&attention)
     }
 
-    /// Queries `[heads, length, d / heads]`, scaled; keys transposed, `[heads, d / heads, length]`; and
-    /// values `[heads, length, d / heads]`.
+    /// Queries `[heads, length, d / heads]`, scaled; keys transposed, `[heads, d / heads, length]`;
+    /// and values `[heads, length, d / heads]`.
     fn queries_keys_values(&self, normed: &Tensor, geometry: &Geometry) -> Result<[Tensor; 3]> {
         let (length, dim) = normed.dims2()?;
         let fused = self.qkv.forward(normed)?;
@@ -321,8 +322,8 @@ impl Block {
     }
 }
 
-/// The attention of the first query, the CLS token, over all keys but its own: `[heads, *, 1 + n]` to
-/// `[heads, n]`.
+/// The attention of the first query, the CLS token, over all keys but its own: `[heads, *, 1 + n]`
+/// to `[heads, n]`.
 fn patch_keys(attention: &Tensor) -> Result<Tensor> {
     let keys = attention.dim(D::Minus1)?;
     attention

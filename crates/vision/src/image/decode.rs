@@ -40,8 +40,8 @@ pub(super) fn catch_panic<T>(
 
 /// Checks the limits, and decodes without turning the image upright.
 ///
-/// If only the size `needed` (as stored) will be used, a far larger JPEG may come out smaller than it
-/// is, but with sides at least twice those needed.
+/// If only the size `needed` (as stored) will be used, a far larger JPEG may come out smaller than
+/// it is, but with sides at least twice those needed.
 pub(super) fn decode_as_stored(
     bytes: &[u8],
     config: &ImageConfig,
@@ -124,8 +124,8 @@ fn jpeg(
 /// The largest of the reductions 1/8, 1/4 and 1/2 that leaves both sides at least twice as long as
 /// needed; `None` if there is none.
 ///
-/// The antialiased resize that follows averages the remaining pixels, so the result differs from that
-/// of a full decode by a level or two of 256.
+/// The antialiased resize that follows averages the remaining pixels, so the result differs from
+/// that of a full decode by a level or two of 256.
 fn reduction(size: ImageSize, needed: ImageSize) -> Option<u32> {
     let leaves_enough = |scale: &u32| {
         size.width / scale >= 2 * needed.width && size.height / scale >= 2 * needed.height

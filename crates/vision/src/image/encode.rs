@@ -20,8 +20,8 @@ pub fn encode_png(image: &RgbImage) -> Result<Vec<u8>, ImageError> {
 /// Encodes as a JPEG of `quality` 1 to 100.
 ///
 /// # Errors
-/// [`ImageError::Unencodable`] if the image has no pixels, or not as many as its size says, or a side
-/// of more than 65,535 pixels.
+/// [`ImageError::Unencodable`] if the image has no pixels, or not as many as its size says, or a
+/// side of more than 65,535 pixels.
 pub fn encode_jpeg(image: &RgbImage, quality: u8) -> Result<Vec<u8>, ImageError> {
     let mut bytes = Vec::new();
     let encoder = JpegEncoder::new_with_quality(&mut bytes, quality.clamp(1, 100));

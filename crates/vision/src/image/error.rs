@@ -36,8 +36,8 @@ pub enum ImageError {
         /// The limit.
         limit: u64,
     },
-    /// Not too many pixels, but so many bytes for each that decoding would take more memory than the
-    /// pixel limit allows.
+    /// Not too many pixels, but so many bytes for each that decoding would take more memory than
+    /// the pixel limit allows.
     #[error("decoding the image takes {bytes} bytes; at most {limit} are allowed")]
     TooDeep {
         /// Bytes of the decoded samples.

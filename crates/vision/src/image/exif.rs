@@ -1,7 +1,7 @@
 //! The EXIF data of a photo: which side is up, and where, in which direction and when it was taken.
 //!
-//! EXIF data is often missing and often broken, so nothing here fails: a tag that is malformed or out
-//! of range counts as missing.
+//! EXIF data is often missing and often broken, so nothing here fails: a tag that is malformed or
+//! out of range counts as missing.
 
 use ::exif::{Exif, In, Rational, Reader, Tag, Value};
 use ::image::metadata::Orientation;

@@ -153,16 +153,17 @@ pub(super) fn check_size(
 }
 
 /// Most scans of a JPEG. Cameras and encoders write one to about ten. Each scan costs the decoder a
-/// pass over the whole picture, however few bytes it has, so without a limit a file of a few megabytes
-/// could keep it busy for hours.
+/// pass over the whole picture, however few bytes it has, so without a limit a file of a few
+/// megabytes could keep it busy for hours.
 pub(super) const MAX_JPEG_SCANS: usize = 100;
 
 /// Checks that a JPEG ends with an end-of-image marker, and that it does not have too many scans.
 ///
-/// Decoders fill what is missing of a picture with grey. Half a picture would match half of a place,
-/// so a file without its end is refused. To find the end, the segments are walked as decoders walk
-/// them; that is possible because compressed data has `FF` only before `00` or a restart marker. Bytes
-/// after the end are ignored: cameras append second pictures and data of their own.
+/// Decoders fill what is missing of a picture with grey. Half a picture would match half of a
+/// place, so a file without its end is refused. To find the end, the segments are walked as
+/// decoders walk them; that is possible because compressed data has `FF` only before `00` or a
+/// restart marker. Bytes after the end are ignored: cameras append second pictures and data of
+/// their own.
 pub(super) fn check_jpeg(bytes: &[u8]) -> Result<(), ImageError> {
     let mut scans = 0;
     // The first two bytes are the start-of-image marker.

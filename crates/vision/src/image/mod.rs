@@ -1,20 +1,21 @@
 //! From bytes to a normalised tensor: limits, decoding, orientation, resizing, normalisation (paper
 //! IV-A).
 //!
-//! The bytes may come from a camera, a phone or an attacker. So the format is recognised by the magic
-//! bytes and never by a name; the size is read from the header and checked before anything is decoded
-//! or allocated; the errors of the decoders become one error type that names the cause; and if a
-//! decoder panics, only that one request fails.
+//! The bytes may come from a camera, a phone or an attacker. So the format is recognised by the
+//! magic bytes and never by a name; the size is read from the header and checked before anything is
+//! decoded or allocated; the errors of the decoders become one error type that names the cause; and
+//! if a decoder panics, only that one request fails.
 //!
-//! The pixels follow torchvision on a Pillow image, because the models were trained on those: 16-bit
-//! samples keep their high byte, alpha is dropped (not blended), and the resize filter is Pillow's
-//! antialiased bilinear one. The one difference is that EXIF orientation is applied, to the small
-//! image after resizing.
+//! The pixels follow torchvision on a Pillow image, because the models were trained on those:
+//! 16-bit samples keep their high byte, alpha is dropped (not blended), and the resize filter is
+//! Pillow's antialiased bilinear one. The one difference is that EXIF orientation is applied, to
+//! the small image after resizing.
 //!
 //! | module | holds |
 //! |---|---|
 //! | `load` | the whole way, from bytes to image or tensor |
-//! | `header`, `decode`, `orientation` | format and limits; one decoder for each format; turning upright |
+//! | `header`, `decode` | format and limits; one decoder for each format |
+//! | `orientation` | turning an image upright |
 //! | `resize` | resizing and normalisation |
 //! | `encode` | back to JPEG and PNG |
 //! | `exif` | position, heading and time of a photo |

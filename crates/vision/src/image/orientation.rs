@@ -25,8 +25,8 @@ pub(super) fn turn_upright(image: RgbImage, orientation: Orientation) -> RgbImag
         return image;
     }
     let RgbImage { size, pixels } = image;
-    // This is `None` only for fewer than width x height x 3 bytes, which neither the decoders nor the
-    // resizer return.
+    // This is `None` only for fewer than width x height x 3 bytes, which neither the decoders nor
+    // the resizer return.
     let buffer = ::image::RgbImage::from_raw(size.width, size.height, pixels).unwrap_or_default();
     let mut image = DynamicImage::ImageRgb8(buffer);
     image.apply_orientation(orientation);

@@ -22,8 +22,8 @@ impl RgbImage {
     }
 }
 
-/// Resizes `image` to `size` with Pillow's BILINEAR filter: its support grows with the reduction, so
-/// that every pixel of the source counts.
+/// Resizes `image` to `size` with Pillow's BILINEAR filter: its support grows with the reduction,
+/// so that every pixel of the source counts.
 ///
 /// # Errors
 /// [`ImageError::EmptyTarget`] if a side of `size` is zero.

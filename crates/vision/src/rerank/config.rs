@@ -11,8 +11,8 @@ pub struct RerankConfig {
     pub scales: Vec<ScaleSet>,
     /// Inlier tolerance in multiples of the base patch size.
     pub tolerance_patches: f32,
-    /// Most homographies that are scored for one combination. Samples of four pairs that no homography
-    /// of a plane can explain are rejected before, and do not count.
+    /// Most homographies that are scored for one combination. Samples of four pairs that no
+    /// homography of a plane can explain are rejected before, and do not count.
     pub max_iterations: u32,
     /// The search stops early once a sample without outliers has been drawn with this probability.
     pub confidence: f64,

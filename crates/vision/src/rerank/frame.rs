@@ -1,8 +1,8 @@
 //! Coordinates in which the homography search computes.
 //!
 //! Pixel coordinates differ in size from the other entries of a homography, which costs precision.
-//! So the origin is moved to the centre of the correspondences and the tolerance becomes the unit of
-//! length, in both images.
+//! So the origin is moved to the centre of the correspondences and the tolerance becomes the unit
+//! of length, in both images.
 
 /// The normalised coordinates of one pair of images.
 pub(super) struct Frame {
@@ -36,7 +36,8 @@ impl Frame {
         })
     }
 
-    /// A homography of this frame, in pixels: `T(u, v)^-1 H T(x, y)`, where T maps pixels to the frame.
+    /// A homography of this frame, in pixels: `T(u, v)^-1 H T(x, y)`, where T maps pixels to the
+    /// frame.
     pub(super) fn denormalise(&self, homography: &[f64; 9]) -> [f64; 9] {
         let [cx, cy, cu, cv] = self.centre;
         let mut out = [0.0; 9];

@@ -2,8 +2,8 @@
 //! score (paper III-D and III-E).
 //!
 //! Two photographs of one place have many patches that look alike and lie alike. Descriptors tell
-//! which patches look alike; a homography that most of these pairs agree with tells whether they lie
-//! alike. The number of pairs that agree is the score by which candidates are ranked.
+//! which patches look alike; a homography that most of these pairs agree with tells whether they
+//! lie alike. The number of pairs that agree is the score by which candidates are ranked.
 //!
 //! | module | step of the paper |
 //! |---|---|

@@ -1,9 +1,10 @@
 //! Mutual nearest neighbours of the key patches of two images (paper III-D, step 6).
 //!
-//! Descriptors are L2-normalised, so the nearest one by Euclidean distance is the one with the largest
-//! dot product. Several of the configured combinations may contain the same pair of scales. So the
-//! dot products of each pair of scales are computed only once ([`placeformer_kernels::similarity`]),
-//! and a combination takes the best over its pairs of scales.
+//! Descriptors are L2-normalised, so the nearest one by Euclidean distance is the one with the
+//! largest dot product. Several of the configured combinations may contain the same pair of scales.
+//! So the dot products of each pair of scales are computed only once
+//! ([`placeformer_kernels::similarity`]), and a combination takes the best over its pairs of
+//! scales.
 
 use placeformer_core::types::{PackedPatches, SCALES, ScaleSet};
 use placeformer_kernels::Simd;
@@ -69,7 +70,8 @@ pub(super) struct Matcher {
 }
 
 impl Matcher {
-    /// Computes the best partner of every patch within every pair of scales that `combinations` need.
+    /// Computes the best partner of every patch within every pair of scales that `combinations`
+    /// need.
     pub(super) fn compare(
         &mut self,
         query: &PreparedQuery,
@@ -124,8 +126,8 @@ fn scale_pairs_of(combinations: &[ScaleSet]) -> Blocks {
     std::array::from_fn(|a| std::array::from_fn(|b| together(a + 1, b + 1)))
 }
 
-/// The best partner of `row` among the scales of a combination. The scales ascend, so of equally good
-/// partners the one with the lowest index wins.
+/// The best partner of `row` among the scales of a combination. The scales ascend, so of equally
+/// good partners the one with the lowest index wins.
 fn best_over(bests: &[Vec<Best>; SCALES], scales: ScaleSet, row: usize) -> Best {
     let mut best = Best::NONE;
     for scale in scales.scales() {

@@ -40,9 +40,9 @@ pub struct CombinationMatch {
     pub score: CombinationScore,
     /// Every mutual pair.
     pub correspondences: Vec<Correspondence>,
-    /// The homography from query to reference pixels of the model's input, `[3, 3]` row-major, scaled
-    /// so that the last entry is 1. If the last entry is 0 (the horizon passes through the top left
-    /// corner of the query), the scale is arbitrary. `None` if there is no homography.
+    /// The homography from query to reference pixels of the model's input, `[3, 3]` row-major,
+    /// scaled so that the last entry is 1. If the last entry is 0 (the horizon passes through the
+    /// top left corner of the query), the scale is arbitrary. `None` if there is no homography.
     pub homography: Option<[f64; 9]>,
 }
 

@@ -2,8 +2,8 @@
 //!
 //! Among false matches, most samples cannot come from one plane that both images see from the same
 //! side: three of the points are nearly on a line, or the quadrilateral changes its orientation. A
-//! vector kernel rejects these at a small part of the cost of solving them. What is left is gathered
-//! densely, so that the solver, which takes 16 samples at a time, has no idle lanes.
+//! vector kernel rejects these at a small part of the cost of solving them. What is left is
+//! gathered densely, so that the solver, which takes 16 samples at a time, has no idle lanes.
 
 use placeformer_kernels::Simd;
 use placeformer_kernels::homography::{self, LANES, PointPairs, Sample};
@@ -13,8 +13,8 @@ pub(super) const CHUNK: usize = 4 * LANES;
 
 /// Least area of the triangles of a sample, twice the area, in squared tolerances.
 ///
-/// Patches lie on a grid with a spacing of 2/3 of the tolerance, so the smallest proper triangle has
-/// 0.44, or 0.11 between the grids of two scales, which are offset by half a patch.
+/// Patches lie on a grid with a spacing of 2/3 of the tolerance, so the smallest proper triangle
+/// has 0.44, or 0.11 between the grids of two scales, which are offset by half a patch.
 const MIN_AREA: f32 = 0.05;
 
 /// The proper samples of one chunk.

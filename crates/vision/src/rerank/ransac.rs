@@ -4,11 +4,12 @@
 //! Four correspondences determine a homography. Random samples of four are drawn and screened; from
 //! those that pass, homographies are computed, and the correspondences that agree with each are
 //! counted. Whenever one beats the best so far, a least-squares fit on the correspondences near it
-//! tries to gain more. The search stops when a sample without outliers would have been drawn with the
-//! required confidence, if the best share of inliers found so far were the true one.
+//! tries to gain more. The search stops when a sample without outliers would have been drawn with
+//! the required confidence, if the best share of inliers found so far were the true one.
 //!
 //! Correspondences are sorted, and the random generator is seeded from their coordinates. So the
-//! result depends on the correspondences alone: not on their order, on time, threads, or the machine.
+//! result depends on the correspondences alone: not on their order, on time, threads, or the
+//! machine.
 
 use super::frame::Frame;
 use super::proper_samples::{CHUNK, ProperSamples};
@@ -16,19 +17,19 @@ use super::refine::refit;
 use placeformer_kernels::Simd;
 use placeformer_kernels::homography::{self, PointPairs, Sample, Sampler};
 
-/// Most samples that are drawn, for each homography that may be scored. Among false matches about one
-/// sample in eight is proper.
+/// Most samples that are drawn, for each homography that may be scored. Among false matches about
+/// one sample in eight is proper.
 const DRAWS_PER_HOMOGRAPHY: usize = 8;
 
 /// Every so many samples the search decides whether it goes on.
 ///
-/// The number of homographies that are scored, and with it the result, depends on this constant. It is
-/// separate from [`CHUNK`], so that results do not change when samples are drawn or solved in groups
-/// of another size.
+/// The number of homographies that are scored, and with it the result, depends on this constant. It
+/// is separate from [`CHUNK`], so that results do not change when samples are drawn or solved in
+/// groups of another size.
 const ROUND: usize = 8;
 
-/// Reaches of the successive least-squares fits after an improvement, in tolerances. The first one is
-/// wide, because the homography of a sample is inexact.
+/// Reaches of the successive least-squares fits after an improvement, in tolerances. The first one
+/// is wide, because the homography of a sample is inexact.
 const LOCAL_RADII: [f64; 4] = [1.5, 1.2, 1.0, 1.0];
 
 /// Settings of the search.
@@ -45,8 +46,8 @@ pub(super) struct RansacSettings {
 /// The best homography that was found.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Estimate {
-    /// `[3, 3]` row-major, from query to reference pixels; its sign is such that `w` is positive for
-    /// inliers.
+    /// `[3, 3]` row-major, from query to reference pixels; its sign is such that `w` is positive
+    /// for inliers.
     pub(super) homography: [f64; 9],
     /// Number of inliers; see [`is_inlier`].
     pub(super) inliers: u32,
@@ -108,7 +109,8 @@ pub(super) fn is_inlier(homography: &[f64; 9], pair: [f32; 4], tolerance_px: f32
     w > 0.0 && dx * dx + dy * dy <= reach * reach
 }
 
-/// The bits of all coordinates as one number, so that a single comparison orders two correspondences.
+/// The bits of all coordinates as one number, so that a single comparison orders two
+/// correspondences.
 fn sort_key(pair: &[f32; 4]) -> u128 {
     let mut key = 0;
     for value in pair {
@@ -231,8 +233,8 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Number of samples among which one has inliers only, with the required confidence, if the best
-    /// share of inliers is the true one.
+    /// Number of samples among which one has inliers only, with the required confidence, if the
+    /// best share of inliers is the true one.
     fn draws_needed(&self) -> usize {
         let share = self.best as f64 / self.points.len() as f64;
         let all_inliers = share.powi(4);

@@ -13,8 +13,8 @@ use placeformer_kernels::homography::PointPairs;
 const LEAST_PAIRS: usize = 5;
 
 /// Fits the correspondences whose transfer error under `homography` is within `radius` tolerances.
-/// The points are normalised, so that the tolerance is 1. The last entry of `homography` is 1, and so
-/// is that of the result, which is row-major too.
+/// The points are normalised, so that the tolerance is 1. The last entry of `homography` is 1, and
+/// so is that of the result, which is row-major too.
 ///
 /// `None` if fewer than five correspondences are near, or they do not determine a homography that
 /// keeps the orientation and has the origin, which is their common centre, in front of the camera.
@@ -32,8 +32,8 @@ pub(super) fn refit(pairs: &PointPairs, homography: &[f64; 9], radius: f64) -> O
     moments.solve().filter(keeps_orientation)
 }
 
-/// The `w` of a correspondence under `homography`, scaled to a last entry of 1, if its transfer error
-/// is within `radius`.
+/// The `w` of a correspondence under `homography`, scaled to a last entry of 1, if its transfer
+/// error is within `radius`.
 fn w_if_near(homography: &[f64; 9], [x, y, u, v]: [f64; 4], radius: f64) -> Option<f64> {
     let [a, b, c, d, e, f, g, h, i] = *homography;
     let w = g * x + h * y + i;

@@ -21,8 +21,8 @@ impl Reranker {
     /// A re-ranker that uses the SIMD level of this process.
     ///
     /// # Panics
-    /// If `PLACEFORMER_SIMD` asks for a level that the CPU lacks. Programs rule that out at start, by
-    /// [`placeformer_kernels::self_check`].
+    /// If `PLACEFORMER_SIMD` asks for a level that the CPU lacks. Programs rule that out at start,
+    /// by [`placeformer_kernels::self_check`].
     pub fn new(config: RerankConfig) -> Self {
         Self::with_simd(config, simd::selected())
     }
@@ -39,18 +39,20 @@ impl Reranker {
 
     /// Scores one pair of images.
     ///
-    /// The result depends on the two images alone: the random samples are seeded from their content.
+    /// The result depends on the two images alone: the random samples are seeded from their
+    /// content.
     ///
     /// # Panics
-    /// If the two were made by different models, so that their descriptors differ in length; or if the
-    /// parts of one image contradict each other.
+    /// If the two were made by different models, so that their descriptors differ in length; or if
+    /// the parts of one image contradict each other.
     pub fn score(&self, query: &PackedPatches, reference: &PackedPatches) -> PairScore {
         with_prepared(self.simd, query, |prepared| {
             self.score_prepared(prepared, reference)
         })
     }
 
-    /// Scores one pair of images, and returns the evidence: one match for each combination of scales.
+    /// Scores one pair of images, and returns the evidence: one match for each combination of
+    /// scales.
     ///
     /// # Panics
     /// As [`score`](Self::score).

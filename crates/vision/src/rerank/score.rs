@@ -30,8 +30,8 @@ pub(super) fn with_workspace<T>(work: impl FnOnce(&mut Workspace) -> T) -> T {
     WORKSPACE.with_borrow_mut(work)
 }
 
-/// Prepares `query`, in memory that this thread has kept from an earlier query, and calls `work` with
-/// it.
+/// Prepares `query`, in memory that this thread has kept from an earlier query, and calls `work`
+/// with it.
 ///
 /// The memory is taken out of the thread-local variable for that time: while `work` waits for other
 /// threads, this thread may be given another query to prepare.

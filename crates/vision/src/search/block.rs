@@ -12,8 +12,8 @@ const _: () = assert!(LENGTH == GLOBAL_DIM);
 /// scan.
 #[cfg(not(test))]
 pub(super) const CAPACITY: usize = 4096;
-/// Small in unit tests, so that they have many borders between blocks. Tests of the public interface
-/// use the real capacity.
+/// Small in unit tests, so that they have many borders between blocks. Tests of the public
+/// interface use the real capacity.
 #[cfg(test)]
 pub(super) const CAPACITY: usize = 64;
 

@@ -23,8 +23,8 @@ const WAITING_PER_THREAD: usize = 2;
 pub struct IndexBuilder {
     /// References for the next block, with ascending ids.
     batch: Vec<IndexEntry>,
-    /// References whose id is not above all ids before, so that they may replace an earlier one. The
-    /// ids of a store ascend, so there are few of these.
+    /// References whose id is not above all ids before, so that they may replace an earlier one.
+    /// The ids of a store ascend, so there are few of these.
     out_of_order: Vec<IndexEntry>,
     highest: Option<ReferenceId>,
     /// Number of batches that were handed to the pool.
@@ -97,8 +97,8 @@ impl IndexBuilder {
 
 /// Waits until `count` blocks are done.
 ///
-/// This may be a thread of the pool itself, and the only one that can pack the waiting batches. So it
-/// executes what is waiting, and sleeps only if there is nothing.
+/// This may be a thread of the pool itself, and the only one that can pack the waiting batches. So
+/// it executes what is waiting, and sleeps only if there is nothing.
 fn wait_for(count: usize, done: &Mutex<Vec<(usize, SealedBlock)>>) {
     while lock(done).len() < count {
         if rayon::yield_now() != Some(rayon::Yield::Executed) {

@@ -1,9 +1,9 @@
 //! A query's filter, prepared so that a few comparisons are enough for most references.
 //!
-//! The exact test whether a point is inside a circle costs a dozen trigonometric calls. But a circle
-//! lies inside a box of latitudes and longitudes, which is computed once. What is outside the box is
-//! outside the circle; and if the ranges of a whole block of references do not overlap the box, none
-//! of its rows has to be looked at.
+//! The exact test whether a point is inside a circle costs a dozen trigonometric calls. But a
+//! circle lies inside a box of latitudes and longitudes, which is computed once. What is outside
+//! the box is outside the circle; and if the ranges of a whole block of references do not overlap
+//! the box, none of its rows has to be looked at.
 
 use placeformer_core::types::{GeoCircle, GeoPoint, ReferenceFilter};
 use time::OffsetDateTime;
@@ -39,8 +39,8 @@ impl PlaceAndTime {
     }
 }
 
-/// The ranges of latitude, longitude and time that the references of a block cover. A range is empty
-/// if no reference has a value.
+/// The ranges of latitude, longitude and time that the references of a block cover. A range is
+/// empty if no reference has a value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Extent {
     lat: (f64, f64),
@@ -119,10 +119,10 @@ impl BoundingBox {
         let west = self.centre_lon - self.half_lon;
         let east = self.centre_lon + self.half_lon;
         let crosses_date_line = west < -180.0 || east > 180.0;
-        let is_beside = extent.lon.1 < west || extent.lon.0 > east;
+        let is_outside_lon = extent.lon.1 < west || extent.lon.0 > east;
         // A box across the date line has a second part, which is not computed. It is rare, so it
         // counts as overlapping.
-        overlaps_lat && (crosses_date_line || !is_beside)
+        overlaps_lat && (crosses_date_line || !is_outside_lon)
     }
 }
 

@@ -13,8 +13,8 @@ use rayon::prelude::*;
 use std::collections::HashMap;
 use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
-/// Least number of blocks that one thread scans at a time. For fewer, handing them to another thread
-/// would take longer than scanning them.
+/// Least number of blocks that one thread scans at a time. For fewer, handing them to another
+/// thread would take longer than scanning them.
 const BLOCKS_PER_TASK: usize = 4;
 
 /// The global descriptors of one map in memory. Searched and changed through `&self` from many
@@ -106,8 +106,8 @@ impl MapIndex {
         Some(vector.to_vec())
     }
 
-    /// The `k` references nearest to `query` (`[256]`) that pass `filter`: nearest first, equally near
-    /// ones by ascending id. Exact (see `scan`).
+    /// The `k` references nearest to `query` (`[256]`) that pass `filter`: nearest first, equally
+    /// near ones by ascending id. Exact (see `scan`).
     ///
     /// # Panics
     /// If the query's length is not 256.

@@ -1,13 +1,13 @@
 //! The sealed blocks of a map: shared with searches, found by id, merged as they become empty.
 //!
-//! A search keeps the list of the blocks that it scans. A change during that time must not alter this
-//! list, and so has to copy it. To keep the copy small, the list is divided into groups of 64 blocks,
-//! each shared through a pointer of its own: a search copies one pointer for every quarter of a
-//! million references, and a change copies one group at most.
+//! A search keeps the list of the blocks that it scans. A change during that time must not alter
+//! this list, and so has to copy it. To keep the copy small, the list is divided into groups of 64
+//! blocks, each shared through a pointer of its own: a search copies one pointer for every quarter
+//! of a million references, and a change copies one group at most.
 //!
-//! Groups and blocks know the range of their ids, so that looking up an id reads hardly any block but
-//! the right one. The ids of the store ascend, which makes the ranges mostly disjoint; nothing depends
-//! on that.
+//! Groups and blocks know the range of their ids, so that looking up an id reads hardly any block
+//! but the right one. The ids of the store ascend, which makes the ranges mostly disjoint; nothing
+//! depends on that.
 
 use super::block::{Block, CAPACITY};
 use super::sealed::SealedBlock;
@@ -192,8 +192,8 @@ impl BlockList {
         })
     }
 
-    /// After a removal from this block: drops it if it is empty, or merges it with another one if both
-    /// are sparse.
+    /// After a removal from this block: drops it if it is empty, or merges it with another one if
+    /// both are sparse.
     fn compact(&mut self, position: BlockPosition) {
         let sealed = self.at(position);
         if sealed.live == 0 {
@@ -230,7 +230,8 @@ impl BlockList {
         None
     }
 
-    /// Takes a sparse block out of the list, and merges its group with another one if both are small.
+    /// Takes a sparse block out of the list, and merges its group with another one if both are
+    /// small.
     fn take(&mut self, position: BlockPosition) {
         let number = position.group;
         let group = Arc::make_mut(&mut self.groups[number]);

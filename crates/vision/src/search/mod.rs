@@ -2,8 +2,8 @@
 //!
 //! A query must see every reference of a map, because an approximate index loses the very places
 //! that re-ranking would have saved. It must do so within milliseconds for a million references,
-//! while references are added and removed. The scan is limited by memory bandwidth, so it reads int8
-//! codes, a quarter of the bytes; `scan` proves why the result is exact nevertheless.
+//! while references are added and removed. The scan is limited by memory bandwidth, so it reads
+//! int8 codes, a quarter of the bytes; `scan` proves why the result is exact nevertheless.
 //!
 //! References are kept in blocks of 4096. A sealed block never changes, so a search takes the list
 //! of them and scans without a lock while the index moves on. New references go to one open block,
@@ -13,9 +13,9 @@
 //!
 //! A removal copies a bitmap of 512 bytes, and the names of 64 blocks if a search holds the list.
 //! Two blocks that are at most half full are merged, which costs each removal a constant share of
-//! one copy. An id above all earlier ones, as those of the store are, is inserted without a look-up.
-//! The ids of the store ascend in the order of insertion, so blocks are mostly sorted already and
-//! their ranges disjoint. That makes operations fast, but nothing depends on it.
+//! one copy. An id above all earlier ones, as those of the store are, is inserted without a
+//! look-up. The ids of the store ascend in the order of insertion, so blocks are mostly sorted
+//! already and their ranges disjoint. That makes operations fast, but nothing depends on it.
 //!
 //! | module | holds |
 //! |---|---|

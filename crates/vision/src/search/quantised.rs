@@ -27,8 +27,8 @@ impl QuantisedVector {
         if scale.is_normal() {
             quantise::quantise(simd, vector, scale, 1.0, &mut codes);
         } else {
-            // Codes times a scale that is zero, subnormal or not finite mean nothing. With all codes
-            // zero, the error is the length of the whole vector, and the bounds stay true.
+            // Codes times a scale that is zero, subnormal or not finite mean nothing. With all
+            // codes zero, the error is the length of the whole vector, and the bounds stay true.
             scale = 0.0;
         }
         let (missed, square) = quantise::squared_lengths(simd, vector, &codes, scale);

@@ -15,10 +15,11 @@
 //! below 2^24, exact in f32 too.
 //!
 //! What is compared in the end is not the real |q - x|^2 but D, the value that [`squared_distance`]
-//! sums in f32. The 256 squares of rounded differences deviate from their real sum by at most
-//! 259 * 2^-24 of it. With |q - x|^2 <= 2A, where A = |q|^2 + |x|^2, that is below 2^-14 A. And
+//! sums in f32. The 256 squares of rounded differences deviate from their real sum by at most 259 *
+//! 2^-24 of it. With |q - x|^2 <= 2A, where A = |q|^2 + |x|^2, that is below 2^-14 A. And
 //! evaluating the bound itself in f32 takes a dozen operations on numbers of at most about A, with
-//! an error below 2^-19 A. Widening the bound by [`SLACK`] = 2^-13 of A on each side covers both, so
+//! an error below 2^-19 A. Widening the bound by [`SLACK`] = 2^-13 of A on each side covers both,
+//! so
 //!
 //! ```text
 //! lower <= D <= upper    for every reference.
@@ -120,7 +121,8 @@ thread_local! {
 }
 
 impl Candidates {
-    /// Adds the rows of a sealed block that may be near; `number` is the block's number in its list.
+    /// Adds the rows of a sealed block that may be near; `number` is the block's number in its
+    /// list.
     pub(super) fn scan(&mut self, query: &Query<'_>, sealed: &SealedBlock, number: usize) {
         let block = &sealed.block;
         if sealed.live == block.len() {
@@ -186,8 +188,8 @@ impl Candidates {
         }
     }
 
-    /// Compares the rows that pass the filter. They are found first, in a loop of their own, because
-    /// they are usually few.
+    /// Compares the rows that pass the filter. They are found first, in a loop of their own,
+    /// because they are usually few.
     fn compare_passing(
         &mut self,
         query: &Query<'_>,
@@ -283,8 +285,8 @@ impl Candidates {
         self
     }
 
-    /// Compares the candidates in full precision and adds them to `nearest`. `block` gives the block
-    /// of a number.
+    /// Compares the candidates in full precision and adds them to `nearest`. `block` gives the
+    /// block of a number.
     pub(super) fn rank<'b>(
         mut self,
         query: &Query<'_>,

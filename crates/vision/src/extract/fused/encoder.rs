@@ -29,7 +29,7 @@ pub struct FusedEncoder {
     geometry: Geometry,
     grid: TokenGrid,
     /// What all calls have in common. Its `chunk_rows` is only a placeholder: how the tokens are
-    /// cut depends on the number of images and threads, so [`Self::plan_for`] sets it anew for each
+    /// cut depends on the number of images and threads, so [`Self::plan_for`] sets it for each
     /// call.
     plan: ChunkPlan,
     embedding: PackedLinear,

@@ -1,8 +1,8 @@
 //! Which number format each product of the transformer uses.
 //!
-//! A [`Precision`] is what the configuration asks for; the CPU decides what it comes to. Layers are
-//! multiplied in f32, bf16 or int8, and this may differ from block to block. The two products of
-//! attention (scores, and the weighted sum of the values) have formats of their own.
+//! A [`Precision`] is what the configuration asks for; what it stands for depends on the CPU.
+//! Layers are multiplied in f32, bf16 or int8, and this may differ from block to block. The two
+//! products of attention (scores, and the weighted sum of the values) have formats of their own.
 
 use crate::extract::encoder::Precision;
 use crate::extract::error::ExtractError;
@@ -37,7 +37,7 @@ impl Formats {
     }
 }
 
-/// The formats that `precision` comes to with the instructions of `simd`, for a transformer of
+/// The formats that `precision` stands for with the instructions of `simd`, for a transformer of
 /// `blocks` blocks.
 ///
 /// # Errors

@@ -26,7 +26,7 @@
 //! | `chunk` | what one thread does with one chunk |
 //! | `weights` | the weights, packed as the kernels read them |
 //! | `formats` | which number format each product uses |
-//! | `smoothing`, `street` | per-channel scales that keep int8 exact, and the picture they come from |
+//! | `smoothing`, `street` | per-channel scales for int8, and the picture they are measured on |
 //! | `operation` | the encoder as one operation of candle |
 
 mod chunk;

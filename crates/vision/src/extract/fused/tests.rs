@@ -185,8 +185,8 @@ fn equals_candle_at_every_level_size_and_exit() {
             let tokens = largest_difference(&actual.tokens, &expected.tokens)
                 .max(largest_difference(&actual.cls_token, &expected.cls_token));
             let attention = largest_difference(&actual.cls_attention, &expected.cls_attention);
-            // Random weights spread a rounding error over all tokens, so these bounds are wide. What
-            // trained weights lose is measured with the real model elsewhere.
+            // Random weights spread a rounding error over all tokens, so these bounds are wide.
+            // What trained weights lose is measured with the real model elsewhere.
             let (least, of_tokens, of_attention) = match precision {
                 Precision::Bf16 => (0.999, 0.3, 0.01),
                 Precision::Mixed | Precision::Int8 => (0.995, 0.4, 0.02),
@@ -223,7 +223,8 @@ fn an_outlier_channel_leaves_int8_as_exact_as_before() {
     let [loss_without_outlier, loss_with_outlier] = [0.0, 40.0].map(|offset| {
         let mut weights = small(4, true);
         for block in &mut weights.blocks {
-            // As in trained transformers: one channel lies far from zero, and its weights are small.
+            // As in trained transformers: one channel lies far from zero, and its weights are
+            // small.
             for (norm, layer) in [
                 (&mut block.norm1, &mut block.qkv),
                 (&mut block.norm2, &mut block.fc1),

@@ -145,7 +145,7 @@ impl Head {
     /// All references of a map pass through here when it gets a new head, so speed matters. An
     /// addition has to wait for the one before it in the same sum; several independent sums at a
     /// time keep the processor busy in the meantime.
-    pub(in crate::extract) fn affine(&self, pooled: &[f32]) -> Vec<f64> {
+    pub(crate) fn affine(&self, pooled: &[f32]) -> Vec<f64> {
         assert_eq!(
             pooled.len(),
             self.dim,

@@ -27,8 +27,8 @@ proptest! {
     }
 }
 
-/// `n` correspondences, of which a `share` follow a homography to within 5 px on each axis, while the
-/// others lie anywhere; the homography; and how many follow it.
+/// `n` correspondences, of which a `share` follow a homography to within 5 px on each axis, while
+/// the others lie anywhere; the homography; and how many follow it.
 fn planted(n: usize, share: f64, seed: u64) -> (Vec<[f32; 4]>, [f64; 9], usize) {
     let mut noise = Noise(seed);
     let mut around =

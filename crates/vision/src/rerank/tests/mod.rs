@@ -1,4 +1,5 @@
-//! Re-ranking compared with the reference implementation, on planted geometry, and on hostile input.
+//! Re-ranking compared with the reference implementation, on planted geometry, and on hostile
+//! input.
 
 mod golden_pairs;
 mod homography;
@@ -72,7 +73,8 @@ fn random_patches(counts: [usize; 3], dim: usize, noise: &mut Noise) -> PackedPa
         let cells = columns * rows;
         assert!(count <= cells);
         let start = noise.next() as usize;
-        // 7 has no factor in common with the numbers of cells (768, 192, 80), so no cell comes twice.
+        // 7 has no factor in common with the numbers of cells (768, 192, 80), so no cell comes
+        // twice.
         index.extend((0..count).map(|i| ((start + 7 * i) % cells) as u16));
     }
     PackedPatches {

@@ -198,7 +198,8 @@ impl ChunkPlan {
             part,
             sums,
             |panel, first_row, product| {
-                // Every slice adds to the same outputs, so only the first one brings the bias.
+                // Every slice adds to the same outputs, so the bias is added with the first one
+                // only.
                 let bias = product.bias.filter(|_| slice == 0);
                 let product = Product { bias, ..product };
                 self.add_to_tokens(panel, first_row, product, chunk);

@@ -6,7 +6,7 @@ use placeformer_kernels::elementwise::{Epilogue, finish_block};
 
 /// An image to be cut into patches.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::extract::fused) struct PatchSource<'a> {
+pub(crate) struct PatchSource<'a> {
     /// Pixels, `[3, height, width]`.
     pub pixels: &'a [f32],
     /// Width of the image in pixels.

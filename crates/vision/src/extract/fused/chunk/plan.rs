@@ -15,7 +15,7 @@ use placeformer_kernels::operand::{Left, OperandBuffer};
 use std::ops::Range;
 
 /// Columns of the MLP's hidden layer that exist at a time.
-pub(in crate::extract::fused) const HIDDEN_SLICE: usize = 384;
+pub(crate) const HIDDEN_SLICE: usize = 384;
 
 /// Rows whose sums exist at a time, few enough that their epilogue finds them in the first-level
 /// cache. A multiple of the tile heights and panel sizes of every level.
@@ -23,7 +23,7 @@ const BLOCK_ROWS: usize = 192;
 
 /// What all chunks of one call have in common.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::extract::fused) struct ChunkPlan {
+pub(crate) struct ChunkPlan {
     pub simd: Simd,
     pub shape: AttentionShape,
     /// Width of a token.
@@ -33,7 +33,7 @@ pub(in crate::extract::fused) struct ChunkPlan {
 }
 
 /// One chunk: its tokens, and what it contributes to the next block.
-pub(in crate::extract::fused) struct Chunk<'a> {
+pub(crate) struct Chunk<'a> {
     /// Number of the chunk within its image.
     pub index: usize,
     /// Tokens, `[chunk_rows, dim]`.
@@ -48,14 +48,14 @@ pub(in crate::extract::fused) struct Chunk<'a> {
 
 /// Keys and values of all chunks of one image.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::extract::fused) struct KeyValues<'a> {
+pub(crate) struct KeyValues<'a> {
     pub keys: &'a [u32],
     pub values: &'a [u32],
 }
 
 /// Buffers of one thread, reused from chunk to chunk.
 #[derive(Default)]
-pub(in crate::extract::fused) struct ChunkScratch {
+pub(crate) struct ChunkScratch {
     /// A product before its epilogue, `[BLOCK_ROWS, columns of a panel]`.
     pub sums: AlignedBuffer<f32>,
     /// Normalised tokens, or the output of attention, `[chunk_rows, dim]`.
