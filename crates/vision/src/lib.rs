@@ -6,8 +6,16 @@
 //! ```
 //!
 //! The four modules never import each other; the service's pipeline composes them.
+//!
+//! All of it is portable Rust. SIMD is in `placeformer-kernels`, which has a scalar twin for every
+//! kernel.
 
 pub mod extract;
 pub mod image;
 pub mod rerank;
 pub mod search;
+
+#[cfg(test)]
+mod golden;
+#[cfg(test)]
+mod tests;

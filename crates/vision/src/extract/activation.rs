@@ -1,7 +1,9 @@
-//! GELU with the exact error function, fast enough not to matter.
+//! GELU with the exact error function.
 //!
-//! The usual scalar `erff` costs a tenth of a whole forward pass. This one is a rational function
-//! of x clamped to +-4, without branches, which the compiler turns into vector code.
+//! The models are trained with this form, not with the tanh approximation. A scalar `erff` from a
+//! math library would take a tenth of a whole forward pass. Here the error function is a rational
+//! function of x, clamped to -4..4; without branches the compiler turns it into vector code, and
+//! its cost no longer matters.
 
 /// x / 2 * (1 + erf(x / sqrt 2)), in place.
 pub fn gelu(values: &mut [f32]) {
@@ -10,13 +12,14 @@ pub fn gelu(values: &mut [f32]) {
     }
 }
 
-/// The error function to within 5e-7 absolute.
+/// The error function to within 5e-7, absolute. Numerator and denominator are evaluated by Horner's
+/// rule.
 #[inline(always)]
 fn erf(x: f32) -> f32 {
     let x = x.clamp(-4.0, 4.0);
     let t = x * x;
-    let mut p = -2.726_142_4e-10;
-    for c in [
+    let mut numerator = -2.726_142_4e-10;
+    for coefficient in [
         2.770_681_3e-8,
         -2.101_024e-6,
         -5.692_506_4e-5,
@@ -24,18 +27,18 @@ fn erf(x: f32) -> f32 {
         -2.954_6e-3,
         -1.609_603_3e-2,
     ] {
-        p = p * t + c;
+        numerator = numerator * t + coefficient;
     }
-    let mut q = -1.456_607_2e-5;
-    for c in [
+    let mut denominator = -1.456_607_2e-5;
+    for coefficient in [
         -2.133_740_6e-4,
         -1.682_827e-3,
         -7.373_329_2e-3,
         -1.426_473_9e-2,
     ] {
-        q = q * t + c;
+        denominator = denominator * t + coefficient;
     }
-    x * p / q
+    x * numerator / denominator
 }
 
 #[cfg(test)]
@@ -44,7 +47,8 @@ mod tests {
 
     /// erf by its Taylor series in f64, good to 1e-12 for |x| <= 5.
     fn reference(x: f64) -> f64 {
-        let (mut term, mut sum) = (x, x);
+        let mut term = x;
+        let mut sum = x;
         for n in 1..200 {
             term *= -x * x / n as f64;
             sum += term / (2 * n + 1) as f64;
@@ -59,10 +63,9 @@ mod tests {
             .map(|x| (erf(x as f32) as f64 - reference(x)).abs())
             .fold(0.0, f64::max);
         assert!(worst < 5e-7, "{worst:e}");
-        assert_eq!(
-            (erf(0.0), erf(f32::INFINITY).round(), erf(-100.0).round()),
-            (0.0, 1.0, -1.0)
-        );
+        assert_eq!(erf(0.0), 0.0);
+        assert_eq!(erf(f32::INFINITY).round(), 1.0);
+        assert_eq!(erf(-100.0).round(), -1.0);
     }
 
     #[test]

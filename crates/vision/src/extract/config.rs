@@ -1,7 +1,7 @@
-//! Settings of extraction: every point the paper leaves open, by name.
+//! Settings of extraction: every point that the paper leaves open, by name.
 
 use super::encoder::{EncoderSpec, Precision};
-use super::preset::Preset;
+use super::preset::{Geometry, Preset};
 use placeformer_core::types::{ImageSize, InvalidValue, PoolingStride, SCALES};
 use serde::{Deserialize, Serialize};
 use std::convert::Infallible;
@@ -9,40 +9,42 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-/// Settings of extraction. What is `None` is the preset's own; see [`ExtractConfig::effective`].
+/// Settings of extraction. A setting that is `None` takes the preset's value; see
+/// [`ExtractConfig::effective`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ExtractConfig {
     /// The backbone.
     pub preset: Preset,
-    /// Weights file of one's own for the preset's geometry; the preset's published ones, pulled on
-    /// first use, unless set.
+    /// A weights file for the preset's geometry. Unless set, the preset's published weights are
+    /// used, and downloaded on first use.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub weights: Option<PathBuf>,
-    /// Size images are squashed to, each side a multiple of the patch size.
+    /// Size in pixels to which images are resized; each side a multiple of the patch size.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub input_size: Option<ImageSize>,
-    /// 0-based block whose tokens are used; later blocks are not computed.
+    /// Number, from 0, of the block whose output tokens are used. Later blocks are not computed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exit_block: Option<usize>,
     /// Whether the tokens pass the final LayerNorm.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub token_norm: Option<bool>,
-    /// 0-based block whose CLS attention ranks patches; the exit block unless set.
+    /// Number, from 0, of the block whose CLS attention ranks the patches; the exit block unless
+    /// set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub attention_block: Option<usize>,
-    /// Attention heads, for weights trained with another count than the preset's (no tensor's shape
-    /// reveals it).
+    /// Number of attention heads, for weights that were trained with another number than the preset
+    /// has. It cannot be seen from the shape of any tensor.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub heads: Option<usize>,
     /// Key patches must exceed this multiple of the uniform attention heads/n; 1 is the paper's
-    /// 0.01.
+    /// 0.01 (III-C).
     pub tau: f32,
-    /// Most key patches at scales 1, 2 and 3.
+    /// Most key patches at scales 1, 2 and 3 (paper III-C).
     pub caps: [usize; SCALES],
-    /// Distance between fused windows.
+    /// Distance between the windows that are pooled at scales 2 and 3 (paper III-B).
     pub stride: PoolingStride,
-    /// The projection to the global descriptor: `default`, `none`, or a file.
+    /// The projection to the global descriptor (paper III-A): `default`, `none`, or a file.
     pub head: HeadChoice,
     /// Arithmetic of the linear layers.
     pub precision: Precision,
@@ -71,13 +73,13 @@ impl Default for ExtractConfig {
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(from = "String", into = "String")]
 pub enum HeadChoice {
-    /// The one built in for this backbone; an error where there is none.
+    /// The one built in for this backbone; it is an error if there is none.
     #[default]
     Default,
-    /// None: the pooled token itself, of the backbone's width. For evaluation and for fitting
-    /// heads; not searchable.
+    /// None: the global descriptor is the pooled vector itself, as long as the backbone makes it.
+    /// For evaluation and for fitting heads; such descriptors cannot be searched.
     None,
-    /// A file.
+    /// A head file.
     File(PathBuf),
 }
 
@@ -116,12 +118,15 @@ impl fmt::Display for HeadChoice {
 }
 
 impl ExtractConfig {
-    /// The size images are squashed to.
+    /// The size in pixels to which images are resized.
     pub fn input_size(&self) -> ImageSize {
         self.input_size.unwrap_or(self.preset.input_size())
     }
 
-    /// What an encoder must compute, checked against the preset's geometry.
+    /// What an encoder must compute with these settings.
+    ///
+    /// # Errors
+    /// A setting that does not fit the preset's geometry; the error names it.
     pub fn encoder_spec(&self) -> Result<EncoderSpec, InvalidValue> {
         let exit_block = self.exit_block.unwrap_or(self.preset.exit_block());
         let spec = EncoderSpec {
@@ -134,7 +139,10 @@ impl ExtractConfig {
         Ok(spec)
     }
 
-    /// The same settings with the preset's own values filled in.
+    /// The same settings with the preset's values filled in.
+    ///
+    /// # Errors
+    /// As [`ExtractConfig::encoder_spec`].
     pub fn effective(&self) -> Result<Self, InvalidValue> {
         let spec = self.encoder_spec()?;
         Ok(Self {
@@ -147,68 +155,70 @@ impl ExtractConfig {
     }
 
     fn validate(&self, spec: &EncoderSpec) -> Result<(), InvalidValue> {
-        /// Sides beyond this make a grid that the stored index (16 bits) cannot hold.
-        const LARGEST_GRID: usize = u16::MAX as usize + 1;
         let geometry = self.preset.geometry();
-        let (size, patch) = (spec.input_size, geometry.patch as u32);
-        let refuse = |field, reason: String| Err(InvalidValue::new(field, reason));
-        if size.width == 0
-            || size.height == 0
-            || size.width % patch != 0
-            || size.height % patch != 0
-        {
-            let nearest = |side: u32| ((side + patch / 2) / patch).max(1) * patch;
-            let suggestion = ImageSize {
-                width: nearest(size.width),
-                height: nearest(size.height),
-            };
-            return refuse(
-                "input_size",
-                format!("{size} is not whole patches of {patch} pixels; try {suggestion}"),
-            );
-        }
-        let (columns, rows) = geometry.grid(size);
-        if columns.saturating_mul(rows) > LARGEST_GRID {
-            return refuse(
-                "input_size",
-                format!("{size} makes more than {LARGEST_GRID} patches"),
-            );
-        }
-        for (field, block) in [
-            ("exit_block", spec.exit_block),
-            ("attention_block", spec.attention_block),
-        ] {
-            if block >= geometry.depth {
-                return refuse(
-                    field,
-                    format!("{block} is beyond the last block, {}", geometry.depth - 1),
-                );
-            }
-        }
-        if let Some(heads) = self
-            .heads
-            .filter(|&heads| heads == 0 || !geometry.dim.is_multiple_of(heads))
-        {
-            return refuse(
-                "heads",
-                format!("{heads} does not divide the token width {}", geometry.dim),
-            );
+        check_input_size(spec.input_size, &geometry)?;
+        check_block("exit_block", spec.exit_block, &geometry)?;
+        check_block("attention_block", spec.attention_block, &geometry)?;
+        if let Some(heads) = self.heads {
+            check_heads(heads, &geometry)?;
         }
         if !self.tau.is_finite() || self.tau < 0.0 {
-            return refuse("tau", format!("{} is not a non-negative number", self.tau));
+            let reason = format!("{} is not a non-negative number", self.tau);
+            return Err(InvalidValue::new("tau", reason));
         }
-        if self.caps.iter().any(|&cap| cap > LARGEST_GRID) || self.caps.iter().all(|&cap| cap == 0)
-        {
-            return refuse(
-                "caps",
-                format!(
-                    "{:?} must hold a positive number and none above {LARGEST_GRID}",
-                    self.caps
-                ),
-            );
-        }
-        Ok(())
+        check_caps(&self.caps)
     }
+}
+
+/// Most patches of an image. A stored patch index has 16 bits.
+const MOST_PATCHES: usize = u16::MAX as usize + 1;
+
+fn check_input_size(size: ImageSize, geometry: &Geometry) -> Result<(), InvalidValue> {
+    let patch = geometry.patch as u32;
+    let is_whole = |side: u32| side > 0 && side.is_multiple_of(patch);
+    if !is_whole(size.width) || !is_whole(size.height) {
+        let nearest = |side: u32| ((side + patch / 2) / patch).max(1) * patch;
+        let suggestion = ImageSize {
+            width: nearest(size.width),
+            height: nearest(size.height),
+        };
+        let reason = format!("{size} is not whole patches of {patch} pixels; try {suggestion}");
+        return Err(InvalidValue::new("input_size", reason));
+    }
+    let (columns, rows) = geometry.grid(size);
+    if columns.saturating_mul(rows) > MOST_PATCHES {
+        let reason = format!("{size} makes more than {MOST_PATCHES} patches");
+        return Err(InvalidValue::new("input_size", reason));
+    }
+    Ok(())
+}
+
+fn check_block(field: &'static str, block: usize, geometry: &Geometry) -> Result<(), InvalidValue> {
+    let last = geometry.depth - 1;
+    if block > last {
+        let reason = format!("{block} is beyond the last block, {last}");
+        return Err(InvalidValue::new(field, reason));
+    }
+    Ok(())
+}
+
+fn check_heads(heads: usize, geometry: &Geometry) -> Result<(), InvalidValue> {
+    let dim = geometry.dim;
+    if heads == 0 || !dim.is_multiple_of(heads) {
+        let reason = format!("{heads} does not divide the token width {dim}");
+        return Err(InvalidValue::new("heads", reason));
+    }
+    Ok(())
+}
+
+fn check_caps(caps: &[usize; SCALES]) -> Result<(), InvalidValue> {
+    let is_too_large = caps.iter().any(|&cap| cap > MOST_PATCHES);
+    let has_none = caps.iter().all(|&cap| cap == 0);
+    if is_too_large || has_none {
+        let reason = format!("{caps:?} must hold a positive number and none above {MOST_PATCHES}");
+        return Err(InvalidValue::new("caps", reason));
+    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -218,15 +228,10 @@ mod tests {
     #[test]
     fn what_is_unset_is_the_presets() {
         let spec = ExtractConfig::default().encoder_spec().unwrap();
-        assert_eq!(
-            (
-                spec.exit_block,
-                spec.attention_block,
-                spec.token_norm,
-                spec.blocks()
-            ),
-            (8, 8, false, 9)
-        );
+        assert_eq!(spec.exit_block, 8);
+        assert_eq!(spec.attention_block, 8);
+        assert!(!spec.token_norm);
+        assert_eq!(spec.blocks(), 9);
         let paper = ExtractConfig {
             preset: Preset::PlaceformerVits16,
             ..Default::default()
@@ -250,16 +255,10 @@ mod tests {
             ..Default::default()
         };
         let config = config.effective().unwrap();
-        assert_eq!(
-            toml::from_str::<ExtractConfig>(&toml::to_string(&config).unwrap()).unwrap(),
-            config
-        );
-        assert!(
-            toml::from_str::<ExtractConfig>("tua = 1.0")
-                .unwrap_err()
-                .to_string()
-                .contains("tua")
-        );
+        let text = toml::to_string(&config).unwrap();
+        assert_eq!(toml::from_str::<ExtractConfig>(&text).unwrap(), config);
+        let misspelt = toml::from_str::<ExtractConfig>("tua = 1.0").unwrap_err();
+        assert!(misspelt.to_string().contains("tua"), "{misspelt}");
     }
 
     #[test]

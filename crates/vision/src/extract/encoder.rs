@@ -1,5 +1,7 @@
-//! The door between the transformer and everything after it, so that how it is computed can be
-//! chosen at start.
+//! The interface between the transformer and everything after it.
+//!
+//! How the transformer is computed (in which precision, by which implementation) is chosen at
+//! start; what comes after it only sees [`Encoder`] and [`EncodedImage`].
 
 use super::error::ExtractError;
 use super::preset::Geometry;
@@ -8,11 +10,11 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// Which part of the transformer an encoder computes. Blocks beyond the last one named here are
-/// never run.
+/// Which part of the transformer an encoder computes. Blocks after the last one named here are not
+/// run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct EncoderSpec {
-    /// Size of every image.
+    /// Size of every image in pixels.
     pub input_size: ImageSize,
     /// 0-based block whose output tokens are the patch tokens.
     pub exit_block: usize,
@@ -23,18 +25,18 @@ pub struct EncoderSpec {
 }
 
 impl EncoderSpec {
-    /// How many blocks must be run.
+    /// Number of blocks that must be run.
     pub fn blocks(&self) -> usize {
         self.exit_block.max(self.attention_block) + 1
     }
 }
 
-/// Columns and rows of patch tokens, row-major.
+/// How many patch tokens an image has. They are ordered row by row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct TokenGrid {
-    /// Patches per row.
+    /// Patches in a row.
     pub columns: usize,
-    /// Rows.
+    /// Rows of patches.
     pub rows: usize,
 }
 
@@ -50,25 +52,26 @@ impl TokenGrid {
     }
 }
 
-/// What the transformer makes of one image.
+/// The transformer's output for one image (paper III-A).
 #[derive(Debug, Clone, PartialEq)]
 pub struct EncodedImage {
     /// How the patch tokens lie in the image.
     pub grid: TokenGrid,
     /// Width of a token.
     pub dim: usize,
-    /// Attention heads.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Patch tokens of the exit block, normed or not as the spec says, `[n, dim]`.
+    /// Patch tokens after the exit block, and after the final LayerNorm if the spec asks for it,
+    /// `[n, dim]`.
     pub tokens: Vec<f32>,
     /// The CLS token at the same point, `[dim]`.
     pub cls_token: Vec<f32>,
-    /// Softmax attention of the CLS query over the patch keys of the attention block, the CLS key
-    /// dropped and the rest not renormalised, `[heads, n]`.
+    /// Softmax attention of the CLS query in the attention block, `[heads, n]`. The weight of the
+    /// CLS key itself is left out, and the others are not renormalised.
     pub cls_attention: Vec<f32>,
 }
 
-/// Runs the transformer. A batch gives bit for bit what single images give.
+/// An implementation of the transformer. A batch gives bit for bit what single images give.
 pub trait Encoder: Send + Sync {
     /// What it computes.
     fn spec(&self) -> &EncoderSpec;
@@ -76,10 +79,13 @@ pub trait Encoder: Send + Sync {
     /// A short name of the implementation and its precision, for reports (`candle-f32`).
     fn name(&self) -> String;
 
-    /// Bytes of weights it holds.
+    /// Bytes of weights in memory.
     fn weight_bytes(&self) -> usize;
 
     /// Encodes images of the spec's size.
+    ///
+    /// # Errors
+    /// An image of another size or with too few values, or an output that is not finite.
     fn encode(&self, images: &[ImageTensor]) -> Result<Vec<EncodedImage>, ExtractError>;
 }
 
@@ -87,17 +93,18 @@ pub trait Encoder: Send + Sync {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// The fastest whose answers, re-ranked, are as good as those of f32: mixed where the CPU
-    /// multiplies int8 vectors, else f32.
+    /// The fastest one with which recall after re-ranking is as good as with f32: mixed on CPUs
+    /// that multiply int8 vectors, f32 on others.
     #[default]
     Auto,
     /// 32-bit floats.
     F32,
-    /// bfloat16 products, 32-bit sums.
+    /// bfloat16 factors, 32-bit sums.
     Bf16,
-    /// int8 in the blocks where it shows least, bf16 (f32 where the CPU lacks it) in the others.
+    /// int8 in the blocks where it costs least accuracy, bf16 in the others (f32 on CPUs without
+    /// bf16).
     Mixed,
-    /// 8-bit integer products, 32-bit sums.
+    /// 8-bit integer factors, 32-bit sums.
     Int8,
 }
 
@@ -127,22 +134,19 @@ impl FromStr for Precision {
     type Err = InvalidValue;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        Self::ALL
-            .into_iter()
-            .find(|precision| precision.name().eq_ignore_ascii_case(text))
-            .ok_or_else(|| {
-                InvalidValue::new(
-                    "precision",
-                    format!(
-                        "{text:?} is not one of {}",
-                        Self::ALL.map(Self::name).join(", ")
-                    ),
-                )
-            })
+        let named = |precision: &Self| precision.name().eq_ignore_ascii_case(text);
+        Self::ALL.into_iter().find(named).ok_or_else(|| {
+            let known = Self::ALL.map(Self::name).join(", ");
+            InvalidValue::new("precision", format!("{text:?} is not one of {known}"))
+        })
     }
 }
 
-/// Refuses an image whose size or length is not what the spec and `geometry` need.
+/// Checks that an image has the size that the spec asks for.
+///
+/// # Errors
+/// [`ExtractError::WrongSize`] for another size; [`ExtractError::WrongLength`] if the tensor does
+/// not hold three planes of its stated size.
 pub fn check_image(image: &ImageTensor, spec: &EncoderSpec) -> Result<(), ExtractError> {
     if image.size != spec.input_size {
         return Err(ExtractError::WrongSize {
@@ -161,7 +165,7 @@ pub fn check_image(image: &ImageTensor, spec: &EncoderSpec) -> Result<(), Extrac
     Ok(())
 }
 
-/// The grid of an image of the spec's size.
+/// The grid of patch tokens of an image of the spec's size.
 pub fn token_grid(geometry: &Geometry, spec: &EncoderSpec) -> TokenGrid {
     let (columns, rows) = geometry.grid(spec.input_size);
     TokenGrid { columns, rows }

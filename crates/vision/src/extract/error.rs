@@ -16,10 +16,10 @@ pub enum ExtractError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// A file is not what it should be, as a whole.
+    /// A file as a whole is not what it should be.
     #[error("{}: {reason}", path.display())]
     BadFile {
         /// The file.
@@ -34,20 +34,23 @@ pub enum ExtractError {
         path: PathBuf,
         /// The geometry that was asked for.
         preset: String,
-        /// One sentence each.
+        /// One sentence for each problem.
         problems: Vec<String>,
     },
-    /// The bytes of a file are not the bytes that were fetched.
-    #[error("{}: SHA-256 is {actual}, expected {expected}; delete the file and pull the model again", path.display())]
+    /// The bytes of a file are not those that were downloaded.
+    #[error(
+        "{}: SHA-256 is {actual}, expected {expected}; delete the file and pull the model again",
+        path.display()
+    )]
     HashMismatch {
         /// The file.
         path: PathBuf,
         /// The recorded hash, hexadecimal.
         expected: String,
-        /// The hash of what is there, hexadecimal.
+        /// The hash of the file, hexadecimal.
         actual: String,
     },
-    /// The head was made for other tokens.
+    /// The head was fitted to the tokens of another backbone.
     #[error(
         "the head{} was fitted for {head_backbone}, the model is {backbone}",
         at(path)
@@ -55,21 +58,21 @@ pub enum ExtractError {
     HeadMismatch {
         /// The head's file, unless it is the one built in.
         path: Option<PathBuf>,
-        /// What the head says it belongs to.
+        /// The backbone that the head names.
         head_backbone: String,
-        /// What it was to be used with.
+        /// The backbone it was to be used with.
         backbone: String,
     },
-    /// No head is known for these tokens.
+    /// No head is built in for this backbone.
     #[error(
-        "no head is built in for {backbone}: make one with `placeformer head fit --images DIR --out FILE` and name it \
-         with --head FILE, or as extract.head in the configuration"
+        "no head is built in for {backbone}: make one with `placeformer head fit --images DIR \
+         --out FILE` and name it with --head FILE, or as extract.head in the configuration"
     )]
     NoHead {
         /// The backbone that lacks one.
         backbone: String,
     },
-    /// The image was resized to another size than the model's.
+    /// The image has another size than the model takes.
     #[error("the model takes {expected} images, this one is {actual}")]
     WrongSize {
         /// The model's input size.
@@ -87,12 +90,13 @@ pub enum ExtractError {
         /// Values present.
         actual: usize,
     },
-    /// NaN or infinity came out: the input or the weights are broken.
+    /// The transformer's output is NaN or infinite, because the input or the weights are broken.
     #[error(
-        "the transformer produced values that are not finite; the input image or the weights are broken"
+        "the transformer produced values that are not finite; the input image or the weights are \
+         broken"
     )]
     NotFinite,
-    /// The machine cannot compute at the precision asked for.
+    /// The CPU lacks the instructions for a precision.
     #[error("precision {precision} is not available: {reason}")]
     Precision {
         /// The precision.
@@ -100,49 +104,61 @@ pub enum ExtractError {
         /// Why not.
         reason: String,
     },
-    /// The kernels cannot be used as asked.
+    /// The SIMD kernels cannot be used as the settings ask, or do not compute correctly.
     #[error(transparent)]
     Simd(#[from] SimdError),
     /// The tensor library failed.
     #[error("computing the transformer failed: {0}")]
     Compute(String),
-    /// A map keeps pooled vectors that the head cannot take.
+    /// The pooled vectors that a map keeps were pooled in another way than the head needs.
     #[error(
-        "the map keeps pooled vectors made by {stored}, the head takes those of {head}: one cannot be made of the other \
-         without the images; import them anew with this head, or use a head of {stored}"
+        "the map keeps pooled vectors made by {stored}, the head takes those of {head}: one cannot \
+         be made of the other without the images; import them anew with this head, or use a head \
+         of {stored}"
     )]
     AggregateMismatch {
         /// How the stored vectors were pooled.
         stored: String,
-        /// How the head's would be.
+        /// How the head needs them pooled.
         head: String,
+    },
+    /// A stored pooled vector has another length than the head takes, although the map's model says
+    /// that it fits.
+    #[error("a stored pooled vector has {actual} values, the head takes {expected}")]
+    WrongPooledLength {
+        /// Length that the head takes.
+        expected: usize,
+        /// Length of the stored vector.
+        actual: usize,
     },
     /// Too few tokens to learn visual words from.
     #[error("{words} visual words cannot be learnt from {tokens} tokens")]
     TooFewTokens {
-        /// Words asked for.
+        /// Number of words asked for.
         words: usize,
-        /// Tokens given.
+        /// Number of tokens given.
         tokens: usize,
     },
     /// Too few images to fit a head.
     #[error("a head of {dim} dimensions needs more than {dim} images, got {images}")]
     TooFewImages {
-        /// Output dimensions.
+        /// Length of the global descriptor.
         dim: usize,
-        /// Images seen.
+        /// Number of images given.
         images: usize,
     },
 }
 
+/// The path after a space, or nothing.
 fn at(path: &Option<PathBuf>) -> String {
-    path.as_ref()
-        .map(|path| format!(" {}", path.display()))
-        .unwrap_or_default()
+    match path {
+        Some(path) => format!(" {}", path.display()),
+        None => String::new(),
+    }
 }
 
 impl ExtractError {
-    /// The row of the error table.
+    /// The stable code under which clients see it.
     pub fn code(&self) -> ErrorCode {
         match self {
             Self::Simd(SimdError::Disagrees { .. }) => ErrorCode::Internal,
@@ -150,6 +166,7 @@ impl ExtractError {
             Self::HeadMismatch { .. } | Self::NoHead { .. } | Self::AggregateMismatch { .. } => {
                 ErrorCode::ModelMismatch
             }
+            Self::WrongPooledLength { .. } => ErrorCode::CorruptRecord,
             Self::Io { .. }
             | Self::BadFile { .. }
             | Self::WrongTensors { .. }
@@ -164,7 +181,7 @@ impl ExtractError {
         }
     }
 
-    /// Wraps an I/O error with the path it happened at.
+    /// For `map_err`: adds the path to an I/O error.
     pub fn io(path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
         move |source| Self::Io { path, source }

@@ -1,27 +1,28 @@
-//! Multi-scale patches: tokens and attention average-pooled over 2x2 and 3x3 windows (paper III-B).
+//! Multi-scale patches: tokens and attention, average-pooled over 2x2 and 3x3 windows (paper
+//! III-B).
 
 use placeformer_core::types::PatchGrid;
 
-/// One value per patch: the CLS attention summed over heads, in multiples of the uniform level
-/// heads/n.
+/// The attention of each patch, `[n]`: the CLS attention summed over heads, in multiples of the
+/// uniform level heads/n.
 ///
-/// `cls_attention` is `[heads, n]`; with the paper's 12 heads and 1200 patches a multiple of 1 is
-/// its threshold 0.01.
+/// `cls_attention` is `[heads, n]`. With the paper's 12 heads and 1200 patches the uniform level is
+/// 12/1200, so a multiple of 1 is the paper's threshold of 0.01.
 pub fn attention_map(cls_attention: &[f32], heads: usize) -> Vec<f32> {
     let patches = cls_attention.len() / heads;
-    let multiple = patches as f32 / heads as f32;
+    let inverse_level = patches as f32 / heads as f32;
+    let sum_over_heads = |patch: usize| -> f32 {
+        (0..heads)
+            .map(|head| cls_attention[head * patches + patch])
+            .sum()
+    };
     (0..patches)
-        .map(|i| {
-            (0..heads)
-                .map(|head| cls_attention[head * patches + i])
-                .sum::<f32>()
-                * multiple
-        })
+        .map(|patch| sum_over_heads(patch) * inverse_level)
         .collect()
 }
 
-/// Averages `values` `[rows, columns, channels]` over windows of `scale` x `scale` patches, floor
-/// mode.
+/// Averages `values` `[rows, columns, channels]` over windows of `scale` x `scale` patches. Windows
+/// that do not fit into the grid are left out.
 pub fn average_pool(values: &[f32], grid: &PatchGrid, scale: usize, channels: usize) -> Vec<f32> {
     if scale == 1 {
         return values.to_vec();
@@ -34,8 +35,8 @@ pub fn average_pool(values: &[f32], grid: &PatchGrid, scale: usize, channels: us
     out
 }
 
-/// The average of one window, by its row-major `index` in the fused grid, into `out`
-/// (`[channels]`).
+/// The average of one window, into `out` (`[channels]`). `index` is the row-major number of the
+/// window among those of its scale.
 pub fn average_window(
     values: &[f32],
     grid: &PatchGrid,
@@ -45,18 +46,24 @@ pub fn average_window(
 ) {
     let channels = out.len();
     let stride = grid.stride.at(scale);
-    let (columns, _) = grid.pooled(scale);
-    let (top, left) = (index / columns * stride, index % columns * stride);
-    let window = (0..scale)
-        .flat_map(|y| (0..scale).map(move |x| (top + y) * grid.columns as usize + left + x));
+    let (windows_per_row, _) = grid.pooled(scale);
+    let top = index / windows_per_row * stride;
+    let left = index % windows_per_row * stride;
+
     out.fill(0.0);
-    for patch in window {
-        out.iter_mut()
-            .zip(&values[patch * channels..][..channels])
-            .for_each(|(sum, value)| *sum += value);
+    for row in top..top + scale {
+        for column in left..left + scale {
+            let patch = row * usize::from(grid.columns) + column;
+            let token = &values[patch * channels..][..channels];
+            for (sum, value) in out.iter_mut().zip(token) {
+                *sum += value;
+            }
+        }
     }
     let area = (scale * scale) as f32;
-    out.iter_mut().for_each(|sum| *sum /= area);
+    for sum in out {
+        *sum /= area;
+    }
 }
 
 #[cfg(test)]
@@ -107,15 +114,27 @@ mod tests {
 
     proptest! {
         #[test]
-        fn channels_are_pooled_independently(columns in 2u16..9, rows in 2u16..9, scale in 1usize..4, dense: bool) {
-            let grid = grid(columns, rows, if dense { PoolingStride::One } else { PoolingStride::Kernel });
+        fn channels_are_pooled_independently(
+            columns in 2u16..9,
+            rows in 2u16..9,
+            scale in 1usize..4,
+            dense: bool,
+        ) {
+            let stride = if dense { PoolingStride::One } else { PoolingStride::Kernel };
+            let grid = grid(columns, rows, stride);
             let n = columns as usize * rows as usize;
-            let plane = |seed: usize| (0..n).map(|i| ((i * 7 + seed * 13) % 11) as f32).collect::<Vec<_>>();
-            let (a, b) = (plane(1), plane(2));
-            let both: Vec<f32> = a.iter().zip(&b).flat_map(|(x, y)| [*x, *y]).collect();
-            let (a, b) = (average_pool(&a, &grid, scale, 1), average_pool(&b, &grid, scale, 1));
-            let expected: Vec<f32> = a.iter().zip(&b).flat_map(|(x, y)| [*x, *y]).collect();
-            prop_assert_eq!(average_pool(&both, &grid, scale, 2), expected);
+            let plane = |seed: usize| -> Vec<f32> {
+                (0..n).map(|i| ((i * 7 + seed * 13) % 11) as f32).collect()
+            };
+            let interleaved = |a: &[f32], b: &[f32]| -> Vec<f32> {
+                a.iter().zip(b).flat_map(|(x, y)| [*x, *y]).collect()
+            };
+            let a = plane(1);
+            let b = plane(2);
+            let pooled_together = average_pool(&interleaved(&a, &b), &grid, scale, 2);
+            let pooled_a = average_pool(&a, &grid, scale, 1);
+            let pooled_b = average_pool(&b, &grid, scale, 1);
+            prop_assert_eq!(pooled_together, interleaved(&pooled_a, &pooled_b));
         }
     }
 }

@@ -1,35 +1,32 @@
-//! The mean over patch tokens, L2-normalised (paper III-A); the head then projects it to the global
-//! descriptor.
+//! Arithmetic of global descriptors: the mean over patch tokens, lengths and distances (paper
+//! III-A).
 
-/// Mean of the tokens `[n, dim]`, summed in f64 so that the order of n hundred values does not
-/// matter.
+/// Mean of the tokens `[n, dim]`, `[dim]`. Summed in f64, so that the order of the tokens does not
+/// matter to the f32 result.
 pub fn mean_token(tokens: &[f32], dim: usize) -> Vec<f32> {
     let mut sums = vec![0f64; dim];
     for token in tokens.chunks_exact(dim) {
-        sums.iter_mut()
-            .zip(token)
-            .for_each(|(sum, &value)| *sum += value as f64);
+        for (sum, &value) in sums.iter_mut().zip(token) {
+            *sum += f64::from(value);
+        }
     }
     let count = (tokens.len() / dim).max(1) as f64;
     sums.iter().map(|sum| (sum / count) as f32).collect()
 }
 
-/// Squared Euclidean distance.
+/// Squared Euclidean distance of two vectors of one length.
 pub fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
 }
 
 /// Scales to unit length; a zero vector stays zero.
 pub fn l2_normalise(vector: &mut [f32]) {
-    let norm = vector
-        .iter()
-        .map(|&v| v as f64 * v as f64)
-        .sum::<f64>()
-        .sqrt();
+    let squares: f64 = vector.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
+    let norm = squares.sqrt();
     if norm > 0.0 {
-        vector
-            .iter_mut()
-            .for_each(|v| *v = (*v as f64 / norm) as f32);
+        for value in vector {
+            *value = (f64::from(*value) / norm) as f32;
+        }
     }
 }
 
@@ -40,7 +37,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_mean_does_not_depend_on_the_order_of_tokens(tokens in proptest::collection::vec(-10f32..10.0, 12)) {
+        fn the_mean_does_not_depend_on_the_order_of_tokens(
+            tokens in proptest::collection::vec(-10f32..10.0, 12),
+        ) {
             let reversed: Vec<f32> = tokens.chunks(3).rev().flatten().copied().collect();
             for (a, b) in mean_token(&tokens, 3).iter().zip(mean_token(&reversed, 3)) {
                 prop_assert!((a - b).abs() < 1e-6);
@@ -48,7 +47,9 @@ mod tests {
         }
 
         #[test]
-        fn normalised_vectors_have_unit_length(mut v in proptest::collection::vec(-1e3f32..1e3, 1..64)) {
+        fn normalised_vectors_have_unit_length(
+            mut v in proptest::collection::vec(-1e3f32..1e3, 1..64),
+        ) {
             prop_assume!(v.iter().any(|x| x.abs() > 1e-3));
             l2_normalise(&mut v);
             prop_assert!((v.iter().map(|x| x * x).sum::<f32>() - 1.0).abs() < 1e-5);

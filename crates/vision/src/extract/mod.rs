@@ -1,15 +1,24 @@
-//! A normalised image to its descriptor: transformer, global descriptor, fusion, selection (paper
-//! III-A to III-C).
+//! From a normalised image to its descriptor: transformer, global descriptor, fusion, selection
+//! (paper III-A to III-C).
 //!
 //! ```text
 //! ImageTensor --encoder--> tokens [n, d], CLS attention [heads, n]
 //!     tokens    --aggregate--> pooled [d] --head--> global [256]
-//!     attention --fusion--> per scale --selection--> key patches, fused from tokens
+//!     attention --fusion--> attention per scale --selection--> key patches, averaged from tokens
 //! ```
 //!
-//! [`Extractor`] puts it together from [`ExtractConfig`], a weights file and a [`Head`]; [`pull`]
-//! obtains the weights. [`Encoder`] is the seam between them and the transformer: [`FusedEncoder`]
-//! computes it for the service, [`CandleEncoder`] is the plain implementation it is tested against.
+//! [`Extractor`] puts it together from an [`ExtractConfig`], a weights file and a [`Head`]. The
+//! transformer is behind the trait [`Encoder`]: [`FusedEncoder`] computes it for the service, and
+//! [`CandleEncoder`] is the plain implementation that the other is compared with.
+//!
+//! Imports between the modules go one way:
+//!
+//! ```text
+//! extractor -> model_id, selection, trace, fused -> vit -> weights, positions, encoder
+//! model_id, pca -> head -> aggregate -> vlad -> global
+//! config -> encoder -> preset
+//! all of them -> error
+//! ```
 
 mod activation;
 mod aggregate;
@@ -28,11 +37,13 @@ mod positions;
 mod preset;
 mod record;
 mod selection;
+mod tensor_file;
 mod trace;
 mod vit;
+mod vlad;
 mod weights;
 
-pub use aggregate::{Aggregate, VladWords, sample_tokens};
+pub use aggregate::Aggregate;
 pub use config::{ExtractConfig, HeadChoice};
 pub use encoder::{
     EncodedImage, Encoder, EncoderSpec, Precision, TokenGrid, check_image, token_grid,
@@ -51,4 +62,5 @@ pub use record::{Record, verify as verify_weights};
 pub use selection::{key_patches, select};
 pub use trace::{ExtractionTrace, TraceArray, TraceValues};
 pub use vit::CandleEncoder;
+pub use vlad::{VladWords, sample_tokens};
 pub use weights::{BlockWeights, Linear, Norm, VitWeights};

@@ -1,11 +1,15 @@
-//! What a descriptor depends on, as text; and what of it changes when a map is given another head.
+//! The identity of a model: everything that its descriptors depend on, as text.
+//!
+//! Descriptors of two different models must never be compared, so a map is bound to one identity:
 //!
 //! ```text
 //! dinov2-vits14:0f1e2d3c4b5a:b8 : 448x336 : t1 : k400-200-50 : gem3 : h0123456789ab
 //! preset, weights, exit block     input     key patches        pooling  head
 //! ```
 //!
-//! The pooling is left out where it is the mean, as it was before there was a choice.
+//! The pooling is left out if it is the mean, so that models made before there was a choice keep
+//! their identity. The precision is left out, because descriptors compare across precisions. When a
+//! map is given another head, only the last part changes ([`Head::rebind`]).
 
 use super::aggregate::Aggregate;
 use super::config::ExtractConfig;
@@ -15,109 +19,127 @@ use super::head::Head;
 use super::weights::VitWeights;
 use placeformer_core::types::{ModelId, PoolingStride};
 
+/// What the head's part of an identity begins with.
 const HEAD_MARK: &str = ":h";
 
-/// Preset, weights, heads where they are not the preset's, exit block with an `n` for normed
-/// tokens: `dinov2-vits14:0f1e2d3c4b5a:b8`. A head depends on these and nothing else.
+/// Hexadecimal digits of a hash that are part of an identity.
+const HASH_DIGITS: usize = 12;
+
+/// The part of the identity that tokens depend on: preset, weights, number of heads if it is not
+/// the preset's, exit block, and `n` if tokens pass the final LayerNorm. A head depends on exactly
+/// this.
 pub(super) fn backbone_id(
     config: &ExtractConfig,
     spec: &EncoderSpec,
     weights: &VitWeights,
 ) -> String {
-    let heads = match weights.geometry.heads {
-        heads if heads == config.preset.geometry().heads => String::new(),
-        heads => format!(":heads{heads}"),
+    let preset = config.preset;
+    let hash = weights.content_hash();
+    let hash = &hash[..HASH_DIGITS];
+    let heads = weights.geometry.heads;
+    let heads = if heads == preset.geometry().heads {
+        String::new()
+    } else {
+        format!(":heads{heads}")
     };
+    let block = spec.exit_block;
     let norm = if spec.token_norm { "n" } else { "" };
-    format!(
-        "{}:{}{heads}:b{}{norm}",
-        config.preset,
-        &weights.content_hash()[..12],
-        spec.exit_block
-    )
+    format!("{preset}:{hash}{heads}:b{block}{norm}")
 }
 
-/// The backbone, then everything else a descriptor depends on. The precision is left out on
-/// purpose: descriptors of one model compare across precisions.
+/// The whole identity.
 pub(super) fn compose(
     backbone: &str,
     config: &ExtractConfig,
     spec: &EncoderSpec,
     head: Option<&Head>,
 ) -> ModelId {
-    let attention = match spec.attention_block {
-        block if block == spec.exit_block => String::new(),
-        block => format!(":a{block}"),
-    };
-    let stride = if config.stride == PoolingStride::Kernel {
-        ""
-    } else {
-        ":dense"
-    };
-    let caps = config.caps.map(|cap| cap.to_string()).join("-");
     let size = spec.input_size;
-    let without_head = format!(
-        "{backbone}:{size}{attention}:t{}:k{caps}{stride}",
-        config.tau
-    );
+    let attention = if spec.attention_block == spec.exit_block {
+        String::new()
+    } else {
+        format!(":a{}", spec.attention_block)
+    };
+    let tau = config.tau;
+    let caps = config.caps.map(|cap| cap.to_string()).join("-");
+    let stride = match config.stride {
+        PoolingStride::Kernel => "",
+        PoolingStride::One => ":dense",
+    };
+    let without_head = format!("{backbone}:{size}{attention}:t{tau}:k{caps}{stride}");
     ModelId::new(match head {
         Some(head) => with_head(&without_head, head),
         None => format!("{without_head}{HEAD_MARK}none"),
     })
 }
 
+/// Appends the parts of pooling and head.
 fn with_head(without_head: &str, head: &Head) -> String {
     let pooling = match head.aggregate() {
         Aggregate::Mean => String::new(),
         other => format!(":{other}"),
     };
-    format!(
-        "{without_head}{pooling}{HEAD_MARK}{}",
-        &head.content_hash()[..12]
-    )
+    let hash = head.content_hash();
+    let hash = &hash[..HASH_DIGITS];
+    format!("{without_head}{pooling}{HEAD_MARK}{hash}")
 }
 
 impl Head {
-    /// The identity of a map of `model` once its pooled vectors have passed through this head.
+    /// The identity that a map of `model` has once its pooled vectors were projected by this head.
     ///
     /// # Errors
-    /// The map's tokens come from another backbone, or its pooled vectors were pooled otherwise
-    /// than this head needs.
+    /// [`ExtractError::HeadMismatch`] if the map's tokens come from another backbone;
+    /// [`ExtractError::AggregateMismatch`] if they were pooled in another way than this head needs.
     pub fn rebind(&self, model: &ModelId) -> Result<ModelId, ExtractError> {
-        let other_tokens = || ExtractError::HeadMismatch {
+        let identity = parse(model.as_str(), self.backbone());
+        let identity = identity.ok_or_else(|| ExtractError::HeadMismatch {
             path: None,
             head_backbone: self.backbone().to_owned(),
             backbone: model.to_string(),
-        };
-        let (kept, _) = model
-            .as_str()
-            .rsplit_once(HEAD_MARK)
-            .ok_or_else(other_tokens)?;
-        let settings = kept
-            .strip_prefix(self.backbone())
-            .and_then(|rest| rest.strip_prefix(':'));
-        let settings = settings.ok_or_else(other_tokens)?;
-        let is_pooling = |part: &&str| part.starts_with("gem") || part.starts_with("vlad");
-        let stored = settings.split(':').next_back().filter(is_pooling);
-        let without_head = match stored {
-            Some(stored) => &kept[..kept.len() - stored.len() - 1],
-            None => kept,
-        };
-        let (stored, own) = (stored.unwrap_or("mean"), self.aggregate().to_string());
-        if stored != own {
+        })?;
+        let needed = self.aggregate().to_string();
+        if identity.pooling != needed {
             return Err(ExtractError::AggregateMismatch {
-                stored: stored.to_owned(),
-                head: own,
+                stored: identity.pooling.to_owned(),
+                head: needed,
             });
         }
-        Ok(ModelId::new(with_head(without_head, self)))
+        Ok(ModelId::new(with_head(identity.without_head, self)))
+    }
+}
+
+/// The parts of an identity that matter to a new head.
+struct ParsedIdentity<'a> {
+    /// Everything before pooling and head.
+    without_head: &'a str,
+    /// The pooling; `mean` if none is written.
+    pooling: &'a str,
+}
+
+/// Takes an identity apart; `None` if it does not begin with `backbone`, or has no head part.
+fn parse<'a>(identity: &'a str, backbone: &str) -> Option<ParsedIdentity<'a>> {
+    let (before_head, _) = identity.rsplit_once(HEAD_MARK)?;
+    // The colon keeps `...:b8` from matching `...:b80`.
+    let settings = before_head.strip_prefix(backbone)?.strip_prefix(':')?;
+    let last = settings.rsplit(':').next().unwrap_or(settings);
+    if last.starts_with("gem") || last.starts_with("vlad") {
+        let without_pooling = before_head.len() - last.len() - 1;
+        Some(ParsedIdentity {
+            without_head: &before_head[..without_pooling],
+            pooling: last,
+        })
+    } else {
+        Some(ParsedIdentity {
+            without_head: before_head,
+            pooling: "mean",
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::aggregate::VladWords;
     use super::*;
+    use crate::extract::vlad::VladWords;
     use placeformer_core::types::GLOBAL_DIM;
 
     const BACKBONE: &str = "dinov2-vits14:0f1e2d3c4b5a:b8";
@@ -146,26 +168,25 @@ mod tests {
 
     #[test]
     fn a_map_takes_heads_of_its_own_pooling_and_no_others() {
-        let (config, spec) = (
-            ExtractConfig::default(),
-            ExtractConfig::default().encoder_spec().unwrap(),
-        );
+        let config = ExtractConfig::default();
+        let spec = config.encoder_spec().unwrap();
         for (i, stored) in kinds().into_iter().enumerate() {
             let old = compose(BACKBONE, &config, &spec, Some(&head(stored.clone(), 1.0)));
             for (k, offered) in kinds().into_iter().enumerate() {
                 let new = head(offered.clone(), 2.0);
                 match new.rebind(&old) {
-                    // The very identity a server with the new head has.
+                    // The map then has the identity of a server that starts with the new head.
                     Ok(id) => {
-                        assert_eq!((i, id), (k, compose(BACKBONE, &config, &spec, Some(&new))))
+                        let expected = compose(BACKBONE, &config, &spec, Some(&new));
+                        assert_eq!((i, id), (k, expected));
                     }
                     Err(ExtractError::AggregateMismatch {
                         stored: named,
                         head,
                     }) => {
-                        assert!(
-                            i != k && named == stored.to_string() && head == offered.to_string()
-                        );
+                        assert_ne!(i, k);
+                        assert_eq!(named, stored.to_string());
+                        assert_eq!(head, offered.to_string());
                     }
                     Err(other) => panic!("{other}"),
                 }

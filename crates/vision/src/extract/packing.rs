@@ -1,14 +1,19 @@
 //! Key patches in full precision to the int8 form in which they are matched and stored.
+//!
+//! A descriptor becomes int8 codes and one f32 factor that turns codes back into values. That takes
+//! a quarter of the memory and loses no recall.
 
 use half::f16;
 use placeformer_core::types::{KeyPatches, PackedPatches};
 use placeformer_kernels::{quantise, simd};
 
-/// Quantises descriptors symmetrically: the largest magnitude of each becomes 127, and its factor
-/// turns codes back into values.
+/// The largest magnitude of an int8 code.
+const LARGEST_CODE: f32 = 127.0;
+
+/// Quantises descriptors symmetrically: the largest magnitude of each becomes 127.
 ///
 /// # Panics
-/// Where `PLACEFORMER_SIMD` asks for a level the CPU lacks. Programs have checked that at start, by
+/// If `PLACEFORMER_SIMD` asks for a level that the CPU lacks. Programs rule that out at start, by
 /// [`placeformer_kernels::self_check`].
 pub fn pack(patches: &KeyPatches) -> PackedPatches {
     let simd = simd::selected();
@@ -24,15 +29,17 @@ pub fn pack(patches: &KeyPatches) -> PackedPatches {
         codes: Vec::with_capacity(total * patches.dim),
     };
     for scale in &patches.scales {
-        packed.index.extend(scale.index.iter().map(|&i| i as u16));
-        let attention = scale.attention.iter().map(|&a| f16::from_f32(a));
+        let index = scale.index.iter().map(|&index| index as u16);
+        let attention = scale.attention.iter().map(|&value| f16::from_f32(value));
+        packed.index.extend(index);
         packed.attention.extend(attention);
         for descriptor in scale.descriptors.chunks_exact(patches.dim) {
             let peak = quantise::largest(simd, descriptor).max(f32::MIN_POSITIVE);
-            packed.factor.push(peak / 127.0);
+            packed.factor.push(peak / LARGEST_CODE);
             let start = packed.codes.len();
             packed.codes.resize(start + patches.dim, 0);
-            quantise::quantise(simd, descriptor, peak, 127.0, &mut packed.codes[start..]);
+            let codes = &mut packed.codes[start..];
+            quantise::quantise(simd, descriptor, peak, LARGEST_CODE, codes);
         }
     }
     packed
@@ -64,14 +71,13 @@ mod tests {
             scales: [Default::default(), one, Default::default()],
         };
         let packed = pack(&patches);
-        assert_eq!(
-            (packed.counts, packed.scale_of(0), packed.rows(2)),
-            ([0, 1, 0], 2, 0..1)
-        );
-        for (code, value) in packed.codes.iter().zip(&values) {
-            assert!(
-                (*code as f32 * packed.factor[0] - value).abs() <= packed.factor[0] / 2.0 + 1e-6
-            );
+        assert_eq!(packed.counts, [0, 1, 0]);
+        assert_eq!(packed.scale_of(0), 2);
+        assert_eq!(packed.rows(2), 0..1);
+        let factor = packed.factor[0];
+        for (&code, value) in packed.codes.iter().zip(&values) {
+            let error = (f32::from(code) * factor - value).abs();
+            assert!(error <= factor / 2.0 + 1e-6);
         }
     }
 }

@@ -1,9 +1,12 @@
-//! Fits a head without labels: PCA of pooled tokens to 256 components with half whitening.
+//! Fits a head without labels: a PCA of pooled tokens to 256 components, half whitened.
 //!
-//! Components are divided by the square root of their standard deviation, half way between plain
-//! PCA, in which a few strong components drown the rest, and full whitening, which raises the noise
-//! of the weak ones. The covariance is gathered image by image, so the number of images does not
-//! matter to memory.
+//! In plain PCA a few strong components decide every distance. Full whitening gives all components
+//! the same variance, and so amplifies the noise in the weak ones. Half whitening lies between: a
+//! component is divided by the square root of its standard deviation.
+//!
+//! The covariance is gathered image by image, so the memory needed does not depend on the number of
+//! images. For vectors that are longer than there are images ([`half_whitened_head_of_few`]), the
+//! components come from the matrix of inner products instead, which is smaller than the covariance.
 
 use super::aggregate::Aggregate;
 use super::error::ExtractError;
@@ -12,17 +15,22 @@ use nalgebra::{DMatrix, SymmetricEigen};
 use placeformer_core::types::GLOBAL_DIM;
 use std::collections::BTreeMap;
 
+/// Components whose variance is below this share of the strongest one's hold rounding noise only.
+/// They are scaled as if they had that much, so that the noise is not amplified.
+const LEAST_VARIANCE: f64 = 1e-9;
+
 /// Mean and covariance of vectors seen one at a time (Welford's update, in f64).
 #[derive(Debug, Clone)]
 pub struct Covariance {
     count: usize,
     mean: Vec<f64>,
-    /// Sum of outer products of deviations, lower triangle filled, `[dim, dim]` row-major.
+    /// Sum of the outer products of deviations, `[dim, dim]` row-major; only the lower triangle is
+    /// filled.
     scatter: Vec<f64>,
 }
 
 impl Covariance {
-    /// Of vectors of length `dim`.
+    /// An accumulator for vectors of length `dim`.
     pub fn new(dim: usize) -> Self {
         Self {
             count: 0,
@@ -32,100 +40,118 @@ impl Covariance {
     }
 
     /// Adds one vector.
+    ///
+    /// # Panics
+    /// If it has another length than the others.
     pub fn add(&mut self, vector: &[f32]) {
         let dim = self.mean.len();
         assert_eq!(vector.len(), dim, "all vectors have one length");
         self.count += 1;
-        let before: Vec<f64> = vector
+        let count = self.count as f64;
+        let deviations: Vec<f64> = vector
             .iter()
             .zip(&self.mean)
-            .map(|(&v, mean)| v as f64 - mean)
+            .map(|(&value, mean)| f64::from(value) - mean)
             .collect();
-        let count = self.count as f64;
-        self.mean
-            .iter_mut()
-            .zip(&before)
-            .for_each(|(mean, d)| *mean += d / count);
+        for (mean, deviation) in self.mean.iter_mut().zip(&deviations) {
+            *mean += deviation / count;
+        }
         let shrink = (count - 1.0) / count;
         for (i, row) in self.scatter.chunks_exact_mut(dim).enumerate() {
-            let factor = before[i] * shrink;
-            row[..=i]
-                .iter_mut()
-                .zip(&before)
-                .for_each(|(sum, d)| *sum += factor * d);
+            let factor = deviations[i] * shrink;
+            for (sum, deviation) in row[..=i].iter_mut().zip(&deviations) {
+                *sum += factor * deviation;
+            }
         }
     }
 
-    /// Vectors seen.
+    /// Number of vectors seen.
     pub fn count(&self) -> usize {
         self.count
     }
 
     fn matrix(&self) -> DMatrix<f64> {
         let dim = self.mean.len();
-        let n = (self.count.max(2) - 1) as f64;
-        DMatrix::from_fn(dim, dim, |r, c| self.scatter[r.max(c) * dim + r.min(c)] / n)
+        let degrees_of_freedom = (self.count.max(2) - 1) as f64;
+        DMatrix::from_fn(dim, dim, |row, column| {
+            let lower = row.max(column) * dim + row.min(column);
+            self.scatter[lower] / degrees_of_freedom
+        })
     }
 
-    /// The head for `backbone` whose rows are the 256 strongest components, each divided by
-    /// sigma^0.5. `aggregate` is how the vectors seen were pooled.
+    /// The head for `backbone` whose rows are the 256 strongest components, each divided by the
+    /// square root of its standard deviation. `aggregate` says how the vectors were pooled.
     ///
-    /// Signs are fixed (the largest entry of a component is positive), so equal input gives an
-    /// equal file.
+    /// The sign of a component is arbitrary; it is fixed so that the largest entry is positive.
+    /// Equal input therefore gives an equal file.
+    ///
+    /// # Errors
+    /// [`ExtractError::TooFewImages`] for 256 vectors or fewer.
     pub fn half_whitened_head(
         &self,
         aggregate: Aggregate,
         backbone: &str,
         notes: BTreeMap<String, String>,
     ) -> Result<Head, ExtractError> {
-        enough(self.count)?;
+        check_count(self.count)?;
         let eigen = SymmetricEigen::new(self.matrix());
-        let components = strongest(eigen.eigenvalues.as_slice())
-            .into_iter()
-            .map(|component| {
-                let direction = eigen
-                    .eigenvectors
-                    .column(component)
-                    .iter()
-                    .copied()
-                    .collect();
-                (eigen.eigenvalues[component], direction)
+        let mut components = Vec::with_capacity(GLOBAL_DIM);
+        for index in strongest(eigen.eigenvalues.as_slice()) {
+            let column = eigen.eigenvectors.column(index);
+            components.push(Component {
+                variance: eigen.eigenvalues[index],
+                direction: column.iter().copied().collect(),
             });
-        half_whitened(&self.mean, components.collect(), aggregate, backbone, notes)
+        }
+        half_whitened(&self.mean, &components, aggregate, backbone, notes)
     }
 }
 
-/// As [`Covariance::half_whitened_head`], for vectors longer than there are images: the components
-/// are found through the `[n, n]` matrix of inner products instead of the `[dim, dim]` covariance.
-/// `vectors` are rows of one length.
+/// As [`Covariance::half_whitened_head`], for vectors that are longer than there are images.
+/// `vectors` have one length.
+///
+/// The components are found through the `[n, n]` matrix of inner products, which has the same
+/// eigenvalues as the `[dim, dim]` covariance.
+///
+/// # Errors
+/// [`ExtractError::TooFewImages`] for 256 vectors or fewer.
 pub fn half_whitened_head_of_few(
     vectors: &[Vec<f32>],
     aggregate: Aggregate,
     backbone: &str,
     notes: BTreeMap<String, String>,
 ) -> Result<Head, ExtractError> {
-    enough(vectors.len())?;
-    let (count, dim) = (vectors.len(), vectors[0].len());
-    let mut rows = DMatrix::from_fn(count, dim, |r, c| f64::from(vectors[r][c]));
+    check_count(vectors.len())?;
+    let count = vectors.len();
+    let dim = vectors[0].len();
+    let mut rows = DMatrix::from_fn(count, dim, |row, column| f64::from(vectors[row][column]));
     let mean: Vec<f64> = rows.column_iter().map(|column| column.mean()).collect();
-    rows.column_iter_mut()
-        .zip(&mean)
-        .for_each(|(mut column, mean)| column.add_scalar_mut(-mean));
+    for (mut column, mean) in rows.column_iter_mut().zip(&mean) {
+        column.add_scalar_mut(-mean);
+    }
+
     let eigen = SymmetricEigen::new(&rows * rows.transpose() / (count - 1) as f64);
-    let components = strongest(eigen.eigenvalues.as_slice())
-        .into_iter()
-        .map(|component| {
-            let direction = rows.tr_mul(&eigen.eigenvectors.column(component));
-            let length = direction.norm().max(f64::MIN_POSITIVE);
-            (
-                eigen.eigenvalues[component],
-                direction.iter().map(|value| value / length).collect(),
-            )
+    let mut components = Vec::with_capacity(GLOBAL_DIM);
+    for index in strongest(eigen.eigenvalues.as_slice()) {
+        let direction = rows.tr_mul(&eigen.eigenvectors.column(index));
+        let length = direction.norm().max(f64::MIN_POSITIVE);
+        components.push(Component {
+            variance: eigen.eigenvalues[index],
+            direction: direction.iter().map(|value| value / length).collect(),
         });
-    half_whitened(&mean, components.collect(), aggregate, backbone, notes)
+    }
+    half_whitened(&mean, &components, aggregate, backbone, notes)
 }
 
-fn enough(images: usize) -> Result<(), ExtractError> {
+/// A principal component.
+struct Component {
+    variance: f64,
+    /// A unit vector, `[dim]`.
+    direction: Vec<f64>,
+}
+
+/// Fewer vectors than this span fewer than 256 directions.
+fn check_count(images: usize) -> Result<(), ExtractError> {
     if images > GLOBAL_DIM {
         Ok(())
     } else {
@@ -136,7 +162,7 @@ fn enough(images: usize) -> Result<(), ExtractError> {
     }
 }
 
-/// Indices of the 256 largest values, descending.
+/// Indices of the 256 largest variances, largest first.
 fn strongest(variances: &[f64]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..variances.len()).collect();
     order.sort_by(|&a, &b| variances[b].total_cmp(&variances[a]));
@@ -144,39 +170,37 @@ fn strongest(variances: &[f64]) -> Vec<usize> {
     order
 }
 
-/// The head of `components`: variance and unit direction, strongest first.
+/// The head of `components`, which come strongest first.
 fn half_whitened(
     mean: &[f64],
-    components: Vec<(f64, Vec<f64>)>,
+    components: &[Component],
     aggregate: Aggregate,
     backbone: &str,
     notes: BTreeMap<String, String>,
 ) -> Result<Head, ExtractError> {
-    // Directions without variance carry rounding noise only; a floor keeps them from being blown
-    // up.
-    let floor = components.first().map_or(0.0, |strongest| strongest.0) * 1e-9;
-    let (mut weight, mut bias) = (
-        Vec::with_capacity(GLOBAL_DIM * mean.len()),
-        Vec::with_capacity(GLOBAL_DIM),
-    );
-    for (variance, direction) in components {
-        let sign = direction
+    let strongest = components.first().map_or(0.0, |first| first.variance);
+    let least = strongest * LEAST_VARIANCE;
+    let mut weight = Vec::with_capacity(GLOBAL_DIM * mean.len());
+    let mut bias = Vec::with_capacity(GLOBAL_DIM);
+    for component in components {
+        let direction = &component.direction;
+        let scale = sign_of(direction) * component.variance.max(least).powf(-0.25);
+        weight.extend(direction.iter().map(|value| (value * scale) as f32));
+        let projected_mean: f64 = direction
             .iter()
-            .copied()
-            .max_by(|a, b| a.abs().total_cmp(&b.abs()))
-            .unwrap_or(1.0)
-            .signum();
-        let scale = sign * variance.max(floor).powf(-0.25);
-        weight.extend(direction.iter().map(|v| (v * scale) as f32));
-        bias.push(
-            -direction
-                .iter()
-                .zip(mean)
-                .map(|(v, mean)| v * scale * mean)
-                .sum::<f64>() as f32,
-        );
+            .zip(mean)
+            .map(|(value, mean)| value * scale * mean)
+            .sum();
+        bias.push(-projected_mean as f32);
     }
     Head::new(aggregate, weight, bias, backbone, notes)
+}
+
+/// The sign of the entry of the largest magnitude.
+fn sign_of(direction: &[f64]) -> f64 {
+    let magnitude = |a: &f64, b: &f64| a.abs().total_cmp(&b.abs());
+    let largest = direction.iter().copied().max_by(magnitude);
+    largest.unwrap_or(1.0).signum()
 }
 
 #[cfg(test)]
@@ -207,7 +231,8 @@ mod tests {
         vectors.iter().for_each(|v| streamed.add(v));
         let mean = |i: usize| vectors.iter().map(|v| v[i] as f64).sum::<f64>() / 50.0;
         for (r, c) in [(0, 0), (3, 1), (1, 3), (299, 299)] {
-            let (mr, mc) = (mean(r), mean(c));
+            let mr = mean(r);
+            let mc = mean(c);
             let direct = vectors
                 .iter()
                 .map(|v| (v[r] as f64 - mr) * (v[c] as f64 - mc))
@@ -246,9 +271,11 @@ mod tests {
             .unwrap();
         let few =
             half_whitened_head_of_few(&vectors, Aggregate::Mean, "x", BTreeMap::new()).unwrap();
-        // The strong components are well apart; the weak ones may turn into each other by rounding.
+        // The weak components have nearly equal variances, so rounding may mix them. The strong
+        // ones differ clearly and must agree.
         for vector in &vectors[..20] {
-            let (a, b) = (direct.affine(vector), few.affine(vector));
+            let a = direct.affine(vector);
+            let b = few.affine(vector);
             assert!(
                 a[..40].iter().zip(&b).all(|(a, b)| (a - b).abs() < 1e-3),
                 "{:?} {:?}",

@@ -1,11 +1,18 @@
-//! Learned positions at another grid than they were learned on.
+//! Learned positions at another grid than the one they were learned on.
 //!
-//! Separable bicubic interpolation with a = -0.75, half-pixel centres and replicated borders, to
-//! the exact grid, rows first: what current libraries do for DINOv2. Weights are built in f64 once
-//! per size.
+//! A transformer has one learned vector for each patch of its training grid, CLS first. For another
+//! image size the table is interpolated, exactly as current libraries do it for DINOv2: separable
+//! bicubic with a = -0.75, half-pixel centres, replicated borders, to the exact grid, rows first.
+//! The weights are computed in f64. This happens once, when the model is loaded.
 
-/// Interpolates the position table `[1 + from_rows * from_columns, dim]` (CLS first) to `[1 + rows
-/// * columns, dim]`.
+/// Number of sources of an interpolated value along one axis.
+const TAPS: usize = 4;
+
+/// One source along an axis: its index and its weight.
+type Tap = (usize, f64);
+
+/// Interpolates the position table `[1 + from_rows * from_columns, dim]`, CLS first, to `[1 + rows
+/// * columns, dim]`. `from` and `to` are rows and columns; the CLS position stays as it is.
 pub fn interpolate(
     table: &[f32],
     dim: usize,
@@ -16,48 +23,55 @@ pub fn interpolate(
         return table.to_vec();
     }
     let (cls, patches) = table.split_at(dim);
-    let ((from_rows, from_columns), (rows, columns)) = (from, to);
-    let row_taps: Vec<_> = (0..rows).map(|row| taps(row, from_rows, rows)).collect();
-    let column_taps: Vec<_> = (0..columns)
+    let (from_rows, from_columns) = from;
+    let (rows, columns) = to;
+    let column_taps: Vec<[Tap; TAPS]> = (0..columns)
         .map(|column| taps(column, from_columns, columns))
         .collect();
 
     let row_length = from_columns * dim;
-    let mut stretched = vec![0f64; row_length];
+    let mut blended_row = vec![0f64; row_length];
     let mut out = Vec::with_capacity((1 + rows * columns) * dim);
     out.extend_from_slice(cls);
-    for row_tap in &row_taps {
-        stretched.fill(0.0);
-        for &(source, weight) in row_tap {
-            let source = &patches[source * row_length..][..row_length];
-            stretched
-                .iter_mut()
-                .zip(source)
-                .for_each(|(sum, &value)| *sum += weight * value as f64);
-        }
-        for column_tap in &column_taps {
-            out.extend((0..dim).map(|channel| {
-                column_tap
-                    .iter()
-                    .map(|&(source, weight)| weight * stretched[source * dim + channel])
-                    .sum::<f64>() as f32
-            }));
+    for row in 0..rows {
+        blend_rows(patches, taps(row, from_rows, rows), &mut blended_row);
+        for column_taps in &column_taps {
+            for channel in 0..dim {
+                let terms = column_taps.iter();
+                let value: f64 = terms
+                    .map(|&(column, weight)| weight * blended_row[column * dim + channel])
+                    .sum();
+                out.push(value as f32);
+            }
         }
     }
     out
 }
 
-/// The four sources and weights of output `index` of `to`, along an axis of `from` entries.
-fn taps(index: usize, from: usize, to: usize) -> [(usize, f64); 4] {
+/// The weighted sum of four rows of `patches`, into `out`.
+fn blend_rows(patches: &[f32], taps: [Tap; TAPS], out: &mut [f64]) {
+    let row_length = out.len();
+    out.fill(0.0);
+    for (row, weight) in taps {
+        let source = &patches[row * row_length..][..row_length];
+        for (sum, &value) in out.iter_mut().zip(source) {
+            *sum += weight * f64::from(value);
+        }
+    }
+}
+
+/// The sources of entry `index` of `to` entries, along an axis of `from` entries.
+fn taps(index: usize, from: usize, to: usize) -> [Tap; TAPS] {
     let position = (index as f64 + 0.5) * from as f64 / to as f64 - 0.5;
     let base = position.floor();
     [-1.0, 0.0, 1.0, 2.0].map(|offset| {
-        let source = (base + offset).clamp(0.0, from as f64 - 1.0) as usize;
-        (source, cubic((position - base - offset).abs()))
+        let distance = (position - base - offset).abs();
+        let source = (base + offset).clamp(0.0, from as f64 - 1.0);
+        (source as usize, cubic(distance))
     })
 }
 
-/// Keys' cubic kernel with a = -0.75 at distance `d` in 0..=2.
+/// Keys' cubic kernel with a = -0.75, for a distance `d` in 0..=2.
 fn cubic(d: f64) -> f64 {
     const A: f64 = -0.75;
     if d <= 1.0 {

@@ -1,15 +1,15 @@
-//! Named model geometries: everything about a backbone that its weights do not say themselves.
+//! Named backbones: everything about one that its weights file does not say.
 //!
-//! A preset fixes the shapes a weights file must have and the defaults that go with it: input size,
-//! exit block, and whether tokens pass the final LayerNorm (paper IV-A; the exit block of stock
-//! DINOv2 weights is our measurement).
+//! A preset fixes the shapes that a weights file must have, and the defaults that go with it: input
+//! size, exit block, and whether tokens pass the final LayerNorm (paper IV-A). The exit block of
+//! stock DINOv2 weights was found by our own measurements.
 
 use placeformer_core::types::{ImageSize, InvalidValue};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// LayerNorm epsilon of every backbone here.
+/// Epsilon of all LayerNorms.
 pub const LAYER_NORM_EPS: f32 = 1e-6;
 
 /// A backbone by name.
@@ -25,7 +25,7 @@ pub enum Preset {
     /// DINOv2 ViT-L/14.
     #[serde(rename = "dinov2-vitl14")]
     Dinov2Vitl14,
-    /// The paper's own backbone, ViT-S/16 with 12 heads, for weights trained here or brought along.
+    /// The paper's own backbone, ViT-S/16 with 12 heads, for weights that a user trains or has.
     #[serde(rename = "placeformer-vits16")]
     PlaceformerVits16,
 }
@@ -33,17 +33,17 @@ pub enum Preset {
 /// The shape of a vision transformer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Geometry {
-    /// Transformer blocks.
+    /// Number of transformer blocks.
     pub depth: usize,
     /// Width of a token, d.
     pub dim: usize,
-    /// Attention heads; `dim` is a multiple.
+    /// Number of attention heads; divides `dim`.
     pub heads: usize,
     /// Side of a patch in pixels, p.
     pub patch: usize,
     /// Width of the hidden layer of the MLP.
     pub mlp_dim: usize,
-    /// Whether each residual branch is scaled per channel.
+    /// Whether each residual branch is scaled per channel (LayerScale).
     pub layer_scale: bool,
 }
 
@@ -81,7 +81,7 @@ impl Preset {
         }
     }
 
-    /// One line for people.
+    /// A description in one line.
     pub fn summary(self) -> &'static str {
         match self {
             Self::Dinov2Vits14 => "DINOv2 ViT-S/14, the default",
@@ -93,7 +93,7 @@ impl Preset {
         }
     }
 
-    /// Its shape.
+    /// Its geometry.
     pub fn geometry(self) -> Geometry {
         let dinov2 = |depth, dim, heads| Geometry {
             depth,
@@ -118,8 +118,8 @@ impl Preset {
         }
     }
 
-    /// The input size used unless another is set: the paper's 640x480, and 448x336 where stock
-    /// weights do no better with more.
+    /// The input size in pixels, unless another is set: 640x480 as in the paper, and 448x336 for
+    /// stock weights, which gain nothing from larger images.
     pub fn input_size(self) -> ImageSize {
         match self {
             Self::PlaceformerVits16 => ImageSize {
@@ -133,8 +133,8 @@ impl Preset {
         }
     }
 
-    /// The 0-based block after which tokens are taken: three quarters of the way for stock weights,
-    /// the last block for weights trained for this purpose.
+    /// Number, from 0, of the block after which tokens are taken: three quarters of the way for
+    /// stock weights, the last block for weights that were trained for place recognition.
     pub fn exit_block(self) -> usize {
         match self {
             Self::PlaceformerVits16 => self.geometry().depth - 1,
@@ -157,9 +157,9 @@ impl Preset {
         }
     }
 
-    /// The content hash ([`VitWeights::content_hash`](super::VitWeights::content_hash)) of its
-    /// published weights, where something that ships depends on them bit for bit: the built-in head
-    /// and calibration of the default do.
+    /// The [content hash](crate::extract::VitWeights::content_hash) that its published weights must
+    /// have. Only the default preset has one: its built-in head and calibration were fitted to
+    /// exactly these weights.
     pub fn content_sha256(self) -> Option<&'static str> {
         match self {
             Self::Dinov2Vits14 => {
@@ -169,8 +169,11 @@ impl Preset {
         }
     }
 
-    /// Rows and columns the learned position table may have: DINOv2's 37x37; for the paper's
-    /// geometry any square (as pre-trained) or the grid of the input it was trained at.
+    /// Rows and columns of a learned position table with this many entries (CLS not counted), if
+    /// the preset can have such a table.
+    ///
+    /// DINOv2 has 37x37. The paper's backbone may have any square, as pre-trained on ImageNet, or
+    /// the grid of its own input size, after training.
     pub fn position_grid(self, entries: usize) -> Option<(usize, usize)> {
         let side = entries.isqrt();
         let (columns, rows) = self.geometry().grid(self.input_size());
@@ -192,16 +195,11 @@ impl FromStr for Preset {
     type Err = InvalidValue;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        Self::ALL
-            .into_iter()
-            .find(|preset| preset.name() == text)
-            .ok_or_else(|| {
-                let known: Vec<_> = Self::ALL.iter().map(|preset| preset.name()).collect();
-                InvalidValue::new(
-                    "preset",
-                    format!("{text:?} is not one of {}", known.join(", ")),
-                )
-            })
+        let named = |preset: &Self| preset.name() == text;
+        Self::ALL.into_iter().find(named).ok_or_else(|| {
+            let known = Self::ALL.map(Self::name).join(", ");
+            InvalidValue::new("preset", format!("{text:?} is not one of {known}"))
+        })
     }
 }
 
@@ -215,26 +213,17 @@ mod tests {
             assert_eq!(preset.name().parse::<Preset>().unwrap(), preset);
             assert_eq!(serde_json::to_value(preset).unwrap(), preset.name());
         }
-        assert!(
-            "dinov2"
-                .parse::<Preset>()
-                .unwrap_err()
-                .to_string()
-                .contains("dinov2-vits14")
-        );
+        let unknown = "dinov2".parse::<Preset>().unwrap_err();
+        assert!(unknown.to_string().contains("dinov2-vits14"), "{unknown}");
     }
 
     #[test]
     fn default_sizes_are_whole_patches_and_exits_exist() {
         for preset in Preset::ALL {
-            let (geometry, size) = (preset.geometry(), preset.input_size());
-            assert_eq!(
-                (
-                    size.width as usize % geometry.patch,
-                    size.height as usize % geometry.patch
-                ),
-                (0, 0)
-            );
+            let geometry = preset.geometry();
+            let size = preset.input_size();
+            assert_eq!(size.width as usize % geometry.patch, 0);
+            assert_eq!(size.height as usize % geometry.patch, 0);
             assert!(preset.exit_block() < geometry.depth);
             assert_eq!(geometry.dim % geometry.heads, 0);
         }

@@ -1,23 +1,24 @@
-//! What is known about a fetched weights file: where it came from and the SHA-256 it must have.
+//! Where a downloaded weights file came from, and which SHA-256 it must have.
 //!
-//! Kept beside the file as `<file>.json`. Weights that someone brings along have none and are
-//! checked by names and shapes only.
+//! The record of `<file>` is the JSON file `<file>.json` next to it. Weights that a user brings
+//! have no record; of those only the names and shapes of the tensors are checked.
 
 use super::error::ExtractError;
 use placeformer_core::files::{hash_file, with_suffix, write_atomically};
 use serde::{Deserialize, Serialize};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-/// Where a weights file came from.
+/// Origin and hash of a weights file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Record {
-    /// Preset whose weights they are.
+    /// Name of the preset that the weights belong to.
     pub preset: String,
-    /// Where they were fetched, and how they were converted.
+    /// Where the weights were downloaded, and how they were converted.
     pub source: String,
     /// SHA-256 of the file, hexadecimal.
     pub sha256: String,
-    /// Length of the file.
+    /// Length of the file in bytes.
     pub bytes: u64,
 }
 
@@ -28,33 +29,46 @@ impl Record {
     }
 
     /// The record of `weights`, if there is one.
+    ///
+    /// # Errors
+    /// A record that is there but cannot be read or understood.
     pub fn load(weights: &Path) -> Result<Option<Self>, ExtractError> {
         let path = Self::path(weights);
-        match std::fs::read(&path) {
-            Ok(bytes) => match serde_json::from_slice(&bytes) {
-                Ok(record) => Ok(Some(record)),
-                Err(e) => Err(ExtractError::BadFile {
-                    path,
-                    reason: format!("not a record of weights: {e}"),
-                }),
-            },
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
-            Err(e) => Err(ExtractError::io(path)(e)),
+        let bytes = match std::fs::read(&path) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(ExtractError::io(path)(error)),
+        };
+        match serde_json::from_slice(&bytes) {
+            Ok(record) => Ok(Some(record)),
+            Err(error) => Err(ExtractError::BadFile {
+                path,
+                reason: format!("not a record of weights: {error}"),
+            }),
         }
     }
 
-    /// Writes the record beside `weights`, atomically.
+    /// Writes the record of `weights`. The file appears complete or not at all.
+    ///
+    /// # Errors
+    /// [`ExtractError::Io`] if it cannot be written.
     pub fn save(&self, weights: &Path) -> Result<(), ExtractError> {
         let path = Self::path(weights);
-        let bytes = serde_json::to_vec_pretty(self).map_err(|e| ExtractError::BadFile {
+        let json = serde_json::to_vec_pretty(self);
+        let bytes = json.map_err(|error| ExtractError::BadFile {
             path: path.clone(),
-            reason: e.to_string(),
+            reason: error.to_string(),
         })?;
         write_atomically(&path, &bytes).map_err(ExtractError::io(path))
     }
 }
 
-/// Refuses weights whose bytes are not those of their record.
+/// Checks the bytes of `weights` against their record, and returns it; `None` if there is no record
+/// to check against.
+///
+/// # Errors
+/// [`ExtractError::HashMismatch`] if the bytes are not those that were downloaded; otherwise files
+/// that cannot be read.
 pub fn verify(weights: &Path) -> Result<Option<Record>, ExtractError> {
     let Some(record) = Record::load(weights)? else {
         return Ok(None);

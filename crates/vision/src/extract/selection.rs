@@ -1,11 +1,11 @@
-//! Key patches: the patches the CLS token attends to most, above a threshold (paper III-C).
+//! Key patches: the patches that the CLS token attends to most, above a threshold (paper III-C).
 
 use super::fusion::{attention_map, average_pool, average_window};
 use super::global::l2_normalise;
 use placeformer_core::types::{KeyPatches, PatchGrid, SCALES, ScaleKeyPatches};
 
-/// Indices of at most `cap` values strictly above `tau`, by value descending, ties to the lower
-/// index.
+/// Indices of the `cap` largest values among those strictly above `tau`: largest first, of equal
+/// values the lower index first.
 pub fn select(attention: &[f32], cap: usize, tau: f32) -> Vec<u32> {
     let mut order: Vec<u32> = (0..attention.len() as u32)
         .filter(|&i| attention[i as usize] > tau)
@@ -19,7 +19,10 @@ pub fn select(attention: &[f32], cap: usize, tau: f32) -> Vec<u32> {
     order
 }
 
-/// Key patches of all scales from tokens `[n, dim]` and CLS attention `[heads, n]`.
+/// Key patches of all three scales, from tokens `[n, dim]` and CLS attention `[heads, n]`.
+///
+/// At each scale at most `caps[scale - 1]` patches are chosen, and only such whose attention
+/// exceeds `tau` times the uniform level. Their descriptors are L2-normalised.
 pub fn key_patches(
     tokens: &[f32],
     cls_attention: &[f32],
@@ -34,7 +37,7 @@ pub fn key_patches(
         let attention = average_pool(&base, &grid, scale, 1);
         let index = select(&attention, caps[scale - 1], tau);
         let mut descriptors = vec![0f32; index.len() * dim];
-        // Only the windows that were chosen are fused.
+        // Most windows are not chosen, so only the chosen ones are averaged.
         for (descriptor, &i) in descriptors.chunks_exact_mut(dim.max(1)).zip(&index) {
             average_window(tokens, &grid, scale, i as usize, descriptor);
             l2_normalise(descriptor);
@@ -64,13 +67,18 @@ mod tests {
 
     proptest! {
         #[test]
-        fn selection_is_the_top_of_the_list(values in proptest::collection::vec(0u8..20, 0..200), cap in 0usize..50, tau in 0u8..20) {
+        fn selection_is_the_top_of_the_list(
+            values in proptest::collection::vec(0u8..20, 0..200),
+            cap in 0usize..50,
+            tau in 0u8..20,
+        ) {
             let values: Vec<f32> = values.into_iter().map(f32::from).collect();
             let chosen = select(&values, cap, tau as f32);
             let above = values.iter().filter(|&&v| v > tau as f32).count();
             prop_assert_eq!(chosen.len(), cap.min(above));
             for pair in chosen.windows(2) {
-                let (a, b) = (values[pair[0] as usize], values[pair[1] as usize]);
+                let a = values[pair[0] as usize];
+                let b = values[pair[1] as usize];
                 prop_assert!(a > b || (a == b && pair[0] < pair[1]));
             }
             let least = chosen.last().map_or(f32::INFINITY, |&i| values[i as usize]);
@@ -82,7 +90,12 @@ mod tests {
 
         #[test]
         fn every_key_patch_is_a_unit_vector_of_its_own_window(seed in 0u64..1000) {
-            let grid = PatchGrid { columns: 7, rows: 5, patch_px: 14, stride: PoolingStride::Kernel };
+            let grid = PatchGrid {
+                columns: 7,
+                rows: 5,
+                patch_px: 14,
+                stride: PoolingStride::Kernel,
+            };
             let noise = |i: usize| (((i as u64 + 1) * (seed * 2 + 7919)) % 101) as f32 / 101.0;
             let tokens: Vec<f32> = (0..35 * 4).map(noise).collect();
             let attention: Vec<f32> = (0..2 * 35).map(|i| noise(i + 999) / 17.0).collect();

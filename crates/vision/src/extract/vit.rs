@@ -1,9 +1,11 @@
-//! The vision transformer in candle: the reference implementation of [`Encoder`], in 32-bit floats.
+//! The vision transformer in candle: a plain implementation of [`Encoder`] in 32-bit floats, with
+//! which the fused one is compared.
 //!
-//! Patch embedding, interpolated positions, then pre-norm blocks up to the last one the spec needs
-//! (paper III-A). Images of a batch go through one by one, so that a batch equals its single images
-//! bit for bit; the threads work inside each product. Plain candle ops except GELU, whose scalar
-//! error function would cost a tenth of the time.
+//! Patch embedding, interpolated positions, then pre-norm blocks up to the last one that the spec
+//! needs (paper III-A). The images of a batch are encoded one after another, so that a batch gives
+//! bit for bit what single images give; threads share the work within each product. All operations
+//! are candle's own except GELU, because candle's scalar error function would take a tenth of the
+//! time.
 
 use super::activation;
 use super::encoder::{EncodedImage, Encoder, EncoderSpec, TokenGrid, check_image, token_grid};
@@ -18,12 +20,12 @@ use rayon::prelude::*;
 
 type Result<T> = std::result::Result<T, candle_core::Error>;
 
-/// A transformer cut off after the last block its spec needs.
+/// The transformer, without the blocks after the last one that its spec needs.
 pub struct CandleEncoder {
     spec: EncoderSpec,
     geometry: Geometry,
     grid: TokenGrid,
-    /// `[3 p p, d]` and `[d]`.
+    /// From patches `[3 p p]` to tokens `[d]`.
     patch_embed: Dense,
     /// CLS token plus its position, `[1, d]`.
     cls: Tensor,
@@ -60,34 +62,39 @@ struct Block {
 pub(super) enum BlockLayer {
     /// Queries, keys and values.
     Qkv,
-    /// Projection of what attention mixed.
+    /// Output projection of attention.
     Proj,
-    /// Into the hidden layer of the MLP.
+    /// First layer of the MLP.
     Fc1,
-    /// Out of it.
+    /// Second layer of the MLP.
     Fc2,
 }
 
-/// Sees what the layers are given, one block after the other.
-type Record<'a> = &'a mut dyn FnMut(BlockLayer, &Tensor) -> Result<()>;
+/// Called with the inputs of each linear layer, block by block.
+type InputRecorder<'a> = &'a mut dyn FnMut(BlockLayer, &Tensor) -> Result<()>;
 
-/// What one pass leaves behind.
+/// The results of one forward pass.
 struct Pass {
-    /// `[1 + n, d]`, of the exit block.
+    /// Tokens after the exit block, `[1 + n, d]`.
     tokens: Tensor,
-    /// `[heads, n]`, of the attention block.
+    /// CLS attention in the attention block, `[heads, n]`.
     cls_attention: Tensor,
 }
 
 impl CandleEncoder {
-    /// Copies the weights of the blocks that `spec` needs; positions are interpolated here, once.
+    /// Copies the weights of the blocks that `spec` needs, and interpolates the positions to the
+    /// grid of its input size.
+    ///
+    /// # Errors
+    /// Those of candle.
     pub fn new(
         weights: &VitWeights,
         spec: &EncoderSpec,
     ) -> std::result::Result<Self, ExtractError> {
         let geometry = weights.geometry;
         let grid = token_grid(&geometry, spec);
-        let (dim, patch) = (geometry.dim, geometry.patch);
+        let dim = geometry.dim;
+        let patch = geometry.patch;
         let table = positions::interpolate(
             &weights.positions,
             dim,
@@ -98,7 +105,12 @@ impl CandleEncoder {
             .cls_token
             .iter()
             .zip(&table[..dim])
-            .map(|(token, at)| token + at)
+            .map(|(token, position)| token + position)
+            .collect();
+        let blocks = &weights.blocks[..spec.blocks()];
+        let blocks: Result<Vec<Block>> = blocks
+            .iter()
+            .map(|block| Block::new(block, &geometry))
             .collect();
         Ok(Self {
             spec: *spec,
@@ -107,19 +119,16 @@ impl CandleEncoder {
             patch_embed: Dense::new(&weights.patch_embed, 3 * patch * patch)?,
             cls: tensor(&cls, &[1, dim])?,
             positions: tensor(&table[dim..], &[grid.len(), dim])?,
-            blocks: weights.blocks[..spec.blocks()]
-                .iter()
-                .map(|b| Block::new(b, &geometry))
-                .collect::<Result<_>>()?,
+            blocks: blocks?,
             norm: LayerNorm::new(&weights.norm)?,
         })
     }
 
-    /// Runs the transformer for what goes into its linear layers: `record(layer, inputs)`, `[1 + n,
-    /// width]`, one block after the other.
+    /// Runs the transformer on `image` and calls `record(layer, inputs)` with the inputs `[1 + n,
+    /// width]` of each linear layer, block by block.
     ///
     /// # Errors
-    /// The image's size, or candle's.
+    /// An image of the wrong size, and those of candle.
     pub(super) fn record_inputs(
         &self,
         image: &ImageTensor,
@@ -133,29 +142,22 @@ impl CandleEncoder {
         Ok(())
     }
 
-    fn run(&self, image: &ImageTensor, record: Record<'_>) -> Result<Pass> {
-        let patches = tensor(
-            &self.patches(image),
-            &[
-                self.grid.len(),
-                3 * self.geometry.patch * self.geometry.patch,
-            ],
-        )?;
-        let embedded = (self.patch_embed.forward(&patches)? + &self.positions)?;
-        let mut x = Tensor::cat(&[&self.cls, &embedded], 0)?;
-        let (mut tokens, mut cls_attention) = (None, None);
-        for (i, block) in self.blocks.iter().enumerate() {
-            if i > self.spec.exit_block && i == self.spec.attention_block {
-                // Nothing but the attention of one query is wanted of this last block.
+    fn run(&self, image: &ImageTensor, record: InputRecorder<'_>) -> Result<Pass> {
+        let mut x = self.embed(image)?;
+        let mut tokens = None;
+        let mut cls_attention = None;
+        for (index, block) in self.blocks.iter().enumerate() {
+            if index > self.spec.exit_block && index == self.spec.attention_block {
+                // Of this last block only the attention of the CLS query is needed.
                 cls_attention = Some(block.cls_attention(&x, &self.geometry)?);
                 break;
             }
             let (next, attention) = block.forward(&x, &self.geometry, record)?;
             x = next;
-            if i == self.spec.attention_block {
+            if index == self.spec.attention_block {
                 cls_attention = Some(attention);
             }
-            if i == self.spec.exit_block {
+            if index == self.spec.exit_block {
                 tokens = Some(if self.spec.token_norm {
                     self.norm.forward(&x)?
                 } else {
@@ -172,17 +174,30 @@ impl CandleEncoder {
         }
     }
 
-    /// Patches in row-major order, each as channel, row, column: `[n, 3 p p]`.
+    /// Tokens before the first block, `[1 + n, d]`.
+    fn embed(&self, image: &ImageTensor) -> Result<Tensor> {
+        let patch_len = 3 * self.geometry.patch * self.geometry.patch;
+        let patches = tensor(&self.patches(image), &[self.grid.len(), patch_len])?;
+        let embedded = (self.patch_embed.forward(&patches)? + &self.positions)?;
+        Tensor::cat(&[&self.cls, &embedded], 0)
+    }
+
+    /// The pixels of each patch in the order channel, row, column; patches row by row: `[n, 3 p
+    /// p]`.
     fn patches(&self, image: &ImageTensor) -> Vec<f32> {
         let patch = self.geometry.patch;
-        let (width, height) = (image.size.width as usize, image.size.height as usize);
+        let width = image.size.width as usize;
+        let height = image.size.height as usize;
         let mut out = Vec::with_capacity(image.data.len());
-        for (row, column) in
-            (0..self.grid.rows).flat_map(|r| (0..self.grid.columns).map(move |c| (r, c)))
-        {
-            for (channel, y) in (0..3).flat_map(|channel| (0..patch).map(move |y| (channel, y))) {
-                let start = (channel * height + row * patch + y) * width + column * patch;
-                out.extend_from_slice(&image.data[start..start + patch]);
+        for grid_row in 0..self.grid.rows {
+            for grid_column in 0..self.grid.columns {
+                let left = grid_column * patch;
+                for channel in 0..3 {
+                    for row in grid_row * patch..(grid_row + 1) * patch {
+                        let start = (channel * height + row) * width + left;
+                        out.extend_from_slice(&image.data[start..start + patch]);
+                    }
+                }
             }
         }
         out
@@ -199,51 +214,43 @@ impl Encoder for CandleEncoder {
     }
 
     fn weight_bytes(&self) -> usize {
-        let dense = |layer: &Dense| layer.weight.elem_count() + layer.bias.elem_count();
-        let blocks: usize = self
-            .blocks
-            .iter()
-            .map(|b| {
-                [&b.qkv, &b.proj, &b.fc1, &b.fc2]
-                    .map(dense)
-                    .iter()
-                    .sum::<usize>()
-            })
-            .sum();
-        4 * (blocks + dense(&self.patch_embed) + self.positions.elem_count())
+        let blocks: usize = self.blocks.iter().map(Block::values).sum();
+        let values = blocks + self.patch_embed.values() + self.positions.elem_count();
+        values * size_of::<f32>()
     }
 
     fn encode(
         &self,
         images: &[ImageTensor],
     ) -> std::result::Result<Vec<EncodedImage>, ExtractError> {
-        images
-            .iter()
-            .try_for_each(|image| check_image(image, &self.spec))?;
-        images
-            .iter()
-            .map(|image| {
-                let pass = self.run(image, &mut |_, _| Ok(()))?;
-                let mut tokens = pass.tokens.flatten_all()?.to_vec1::<f32>()?;
-                let cls_token = tokens.drain(..self.geometry.dim).collect();
-                Ok(EncodedImage {
-                    grid: self.grid,
-                    dim: self.geometry.dim,
-                    heads: self.geometry.heads,
-                    tokens,
-                    cls_token,
-                    cls_attention: pass.cls_attention.flatten_all()?.to_vec1::<f32>()?,
-                })
-            })
-            .collect()
+        for image in images {
+            check_image(image, &self.spec)?;
+        }
+        let mut encoded = Vec::with_capacity(images.len());
+        for image in images {
+            let pass = self.run(image, &mut |_, _| Ok(()))?;
+            let mut tokens = pass.tokens.flatten_all()?.to_vec1::<f32>()?;
+            let cls_token = tokens.drain(..self.geometry.dim).collect();
+            encoded.push(EncodedImage {
+                grid: self.grid,
+                dim: self.geometry.dim,
+                heads: self.geometry.heads,
+                tokens,
+                cls_token,
+                cls_attention: pass.cls_attention.flatten_all()?.to_vec1::<f32>()?,
+            });
+        }
+        Ok(encoded)
     }
 }
 
 impl Block {
     fn new(weights: &BlockWeights, geometry: &Geometry) -> Result<Self> {
-        let (dim, mlp_dim) = (geometry.dim, geometry.mlp_dim);
-        let scale =
-            |scale: &Option<Vec<f32>>| scale.as_ref().map(|s| tensor(s, &[s.len()])).transpose();
+        let dim = geometry.dim;
+        let scale = |scale: &Option<Vec<f32>>| match scale {
+            Some(scale) => tensor(scale, &[scale.len()]).map(Some),
+            None => Ok(None),
+        };
         Ok(Self {
             norm1: LayerNorm::new(&weights.norm1)?,
             qkv: Dense::new(&weights.qkv, dim)?,
@@ -251,18 +258,23 @@ impl Block {
             layer_scale1: scale(&weights.layer_scale1)?,
             norm2: LayerNorm::new(&weights.norm2)?,
             fc1: Dense::new(&weights.fc1, dim)?,
-            fc2: Dense::new(&weights.fc2, mlp_dim)?,
+            fc2: Dense::new(&weights.fc2, geometry.mlp_dim)?,
             layer_scale2: scale(&weights.layer_scale2)?,
         })
     }
 
-    /// The block's output `[1 + n, d]` and its CLS attention `[heads, n]`; `record` sees what its
-    /// layers are given.
+    /// Number of values in the linear layers.
+    fn values(&self) -> usize {
+        self.qkv.values() + self.proj.values() + self.fc1.values() + self.fc2.values()
+    }
+
+    /// The block's output `[1 + n, d]` and its CLS attention `[heads, n]`; `record` gets the inputs
+    /// of its linear layers.
     fn forward(
         &self,
         x: &Tensor,
         geometry: &Geometry,
-        record: Record<'_>,
+        record: InputRecorder<'_>,
     ) -> Result<(Tensor, Tensor)> {
         let (length, dim) = x.dims2()?;
         let normed = self.norm1.forward(x)?;
@@ -287,13 +299,13 @@ impl Block {
     /// The CLS attention `[heads, n]` alone.
     fn cls_attention(&self, x: &Tensor, geometry: &Geometry) -> Result<Tensor> {
         let [q, k, _] = self.queries_keys_values(&self.norm1.forward(x)?, geometry)?;
-        patch_keys(&softmax_last_dim(
-            &q.narrow(1, 0, 1)?.contiguous()?.matmul(&k)?,
-        )?)
+        let cls_query = q.narrow(1, 0, 1)?.contiguous()?;
+        let attention = softmax_last_dim(&cls_query.matmul(&k)?)?;
+        patch_keys(&attention)
     }
 
-    /// Scaled queries `[heads, length, d / heads]`, keys transposed `[heads, d / heads, length]`,
-    /// values as queries.
+    /// Queries `[heads, length, d / heads]`, scaled; keys transposed, `[heads, d / heads, length]`;
+    /// and values `[heads, length, d / heads]`.
     fn queries_keys_values(&self, normed: &Tensor, geometry: &Geometry) -> Result<[Tensor; 3]> {
         let (length, dim) = normed.dims2()?;
         let fused = self.qkv.forward(normed)?;
@@ -310,7 +322,8 @@ impl Block {
     }
 }
 
-/// The first query's attention over all keys but the first: `[heads, *, 1 + n]` -> `[heads, n]`.
+/// The attention of the first query, the CLS token, over all keys but its own: `[heads, *, 1 + n]`
+/// to `[heads, n]`.
 fn patch_keys(attention: &Tensor) -> Result<Tensor> {
     let keys = attention.dim(D::Minus1)?;
     attention
@@ -320,7 +333,7 @@ fn patch_keys(attention: &Tensor) -> Result<Tensor> {
         .contiguous()
 }
 
-/// x + branch * scale.
+/// x + branch * scale, without the factor if there is no LayerScale.
 fn residual(x: &Tensor, branch: Tensor, scale: &Option<Tensor>) -> Result<Tensor> {
     match scale {
         Some(scale) => x + branch.broadcast_mul(scale)?,
@@ -335,6 +348,11 @@ impl Dense {
             weight: tensor(&layer.weight, &[out, input])?.t()?.contiguous()?,
             bias: tensor(&layer.bias, &[out])?,
         })
+    }
+
+    /// Number of values.
+    fn values(&self) -> usize {
+        self.weight.elem_count() + self.bias.elem_count()
     }
 
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
@@ -360,7 +378,7 @@ fn tensor(values: &[f32], shape: &[usize]) -> Result<Tensor> {
     Tensor::from_slice(values, shape, &Device::Cpu)
 }
 
-/// Exact GELU in place on a tensor nobody else holds.
+/// Exact GELU in place. Only for a tensor whose storage is not shared with another one.
 struct Gelu;
 
 impl InplaceOp1 for Gelu {

@@ -1,12 +1,14 @@
-//! One decoder per format, all ending in 8-bit RGB as stored; orientation; containment of panics.
+//! One decoder for each format. All of them end in 8-bit RGB, oriented as the file stores it.
 
-use super::header::{self, Format};
-use super::{ImageConfig, ImageError, RgbImage};
+use super::config::ImageConfig;
+use super::error::ImageError;
+use super::header::{self, ImageFormat};
+use super::rgb::RgbImage;
 use ::image::codecs::{png::PngDecoder, webp::WebPDecoder};
-use ::image::metadata::Orientation;
 use ::image::{DynamicImage, ImageDecoder, Limits};
 use placeformer_core::types::ImageSize;
-use std::io::Cursor;
+use std::error::Error;
+use std::io::{self, Cursor, ErrorKind};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use zune_core::bytestream::ZCursor;
 use zune_core::colorspace::ColorSpace;
@@ -14,51 +16,62 @@ use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::errors::DecodeErrors;
 
-/// Runs `work`; a panic inside becomes an error.
-pub(super) fn contained<T>(work: impl FnOnce() -> Result<T, ImageError>) -> Result<T, ImageError> {
-    // Unwind safety: `work` owns its buffers and shares nothing mutable, so nothing half-done
-    // outlives the panic.
-    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
-        let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-        let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
-        Err(ImageError::DecoderPanicked(
-            text.unwrap_or_else(|| "no message".to_owned()),
-        ))
+/// Why a file without all its bytes is refused.
+const ENDS_TOO_EARLY: &str = "truncated: the bytes end too early";
+
+/// Runs `work`, and turns a panic inside it into an error.
+pub(super) fn catch_panic<T>(
+    work: impl FnOnce() -> Result<T, ImageError>,
+) -> Result<T, ImageError> {
+    // `work` owns its buffers and shares nothing that it changes. So no half-changed state remains
+    // after a panic, and asserting unwind safety is right.
+    let result = catch_unwind(AssertUnwindSafe(work));
+    result.unwrap_or_else(|panic| {
+        let text = if let Some(text) = panic.downcast_ref::<&str>() {
+            (*text).to_owned()
+        } else if let Some(text) = panic.downcast_ref::<String>() {
+            text.clone()
+        } else {
+            "no message".to_owned()
+        };
+        Err(ImageError::DecoderPanicked(text))
     })
 }
 
-/// Checks limits and decodes without turning the image upright. A JPEG far larger than what it is
-/// `wanted` for (as stored) may come out smaller, but never less than twice as large.
+/// Checks the limits, and decodes without turning the image upright.
+///
+/// If only the size `needed` (as stored) will be used, a far larger JPEG may come out smaller than
+/// it is, but with sides at least twice those needed.
 pub(super) fn decode_as_stored(
     bytes: &[u8],
     config: &ImageConfig,
-    wanted: Option<ImageSize>,
+    needed: Option<ImageSize>,
 ) -> Result<RgbImage, ImageError> {
-    match header::sniff(bytes, config)? {
-        Format::Jpeg => jpeg(bytes, config, wanted),
-        Format::Png => {
-            header::check_size(Format::Png, header::png_size(bytes)?, config)?;
-            let mut limits = Limits::no_limits();
-            limits.max_alloc = Some(decoded_limit(config));
-            let decoder = PngDecoder::with_limits(Cursor::new(bytes), limits);
-            raster(
-                Format::Png,
-                decoder.map_err(|error| image_error(Format::Png, &error))?,
-                config,
-            )
-        }
-        Format::WebP => {
-            if !header::webp_is_complete(bytes) {
-                return Err(Format::WebP.undecodable("truncated: the bytes end too early"));
-            }
-            let decoder = WebPDecoder::new(Cursor::new(bytes));
-            raster(
-                Format::WebP,
-                decoder.map_err(|error| image_error(Format::WebP, &error))?,
-                config,
-            )
-        }
+    match header::recognise(bytes, config)? {
+        ImageFormat::Jpeg => jpeg(bytes, config, needed),
+        ImageFormat::Png => png(bytes, config),
+        ImageFormat::WebP => webp(bytes, config),
     }
+}
+
+fn png(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError> {
+    let format = ImageFormat::Png;
+    header::check_size(format, header::png_size(bytes)?, config)?;
+    let mut limits = Limits::no_limits();
+    limits.max_alloc = Some(decoded_limit(config));
+    let decoder = PngDecoder::with_limits(Cursor::new(bytes), limits);
+    let decoder = decoder.map_err(|error| image_error(format, &error))?;
+    read_pixels(format, decoder, config)
+}
+
+fn webp(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError> {
+    let format = ImageFormat::WebP;
+    if !header::webp_is_complete(bytes) {
+        return Err(format.undecodable(ENDS_TOO_EARLY));
+    }
+    let decoder = WebPDecoder::new(Cursor::new(bytes));
+    let decoder = decoder.map_err(|error| image_error(format, &error))?;
+    read_pixels(format, decoder, config)
 }
 
 /// Most bytes that decoded samples may take: RGBA at the pixel limit.
@@ -69,11 +82,11 @@ fn decoded_limit(config: &ImageConfig) -> u64 {
 fn jpeg(
     bytes: &[u8],
     config: &ImageConfig,
-    wanted: Option<ImageSize>,
+    needed: Option<ImageSize>,
 ) -> Result<RgbImage, ImageError> {
-    let fail = |error: DecodeErrors| Format::Jpeg.undecodable(jpeg_reason(&error));
-    // The decoder's own limits are opened wide: ours are checked below, on the header, with a
-    // better message.
+    let fail = |error: DecodeErrors| ImageFormat::Jpeg.undecodable(jpeg_reason(&error));
+    // The decoder's own limits are set as high as possible. Ours are checked below, on the header,
+    // with a better message.
     let options = DecoderOptions::default()
         .set_strict_mode(true)
         .set_max_width(usize::from(u16::MAX))
@@ -83,17 +96,18 @@ fn jpeg(
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     decoder.decode_headers().map_err(fail)?;
     let (width, height) = decoder.dimensions().unwrap_or_default();
-    // A JPEG's sides are 16-bit numbers.
+    // The sides of a JPEG are 16-bit numbers, so the conversion loses nothing.
     let size = ImageSize {
         width: width as u32,
         height: height as u32,
     };
-    header::check_size(Format::Jpeg, size, config)?;
+    header::check_size(ImageFormat::Jpeg, size, config)?;
     header::check_jpeg(bytes)?;
-    let simple = matches!(decoder.input_colorspace(), Some(ColorSpace::YCbCr));
-    if let Some(scale) = wanted
-        .and_then(|wanted| reduction(size, wanted))
-        .filter(|_| simple)
+
+    let is_plain_colour = decoder.input_colorspace() == Some(ColorSpace::YCbCr);
+    if is_plain_colour
+        && let Some(needed) = needed
+        && let Some(scale) = reduction(size, needed)
     {
         return jpeg_reduced(bytes, size, scale, config);
     }
@@ -101,34 +115,37 @@ fn jpeg(
     match decoder.output_colorspace() {
         Some(ColorSpace::RGB) => Ok(RgbImage { size, pixels }),
         other => {
-            Err(Format::Jpeg.undecodable(format!("its colours ({other:?}) cannot be shown as RGB")))
+            let reason = format!("its colours ({other:?}) cannot be shown as RGB");
+            Err(ImageFormat::Jpeg.undecodable(reason))
         }
     }
 }
 
-/// The largest of 1/8, 1/4 and 1/2 that leaves both sides at least twice what is wanted: the
-/// antialiased resize that follows then averages what is left, and the result stays within a level
-/// or two of a full decode.
-fn reduction(size: ImageSize, wanted: ImageSize) -> Option<u32> {
+/// The largest of the reductions 1/8, 1/4 and 1/2 that leaves both sides at least twice as long as
+/// needed; `None` if there is none.
+///
+/// The antialiased resize that follows averages the remaining pixels, so the result differs from
+/// that of a full decode by a level or two of 256.
+fn reduction(size: ImageSize, needed: ImageSize) -> Option<u32> {
     let leaves_enough = |scale: &u32| {
-        size.width / scale >= 2 * wanted.width && size.height / scale >= 2 * wanted.height
+        size.width / scale >= 2 * needed.width && size.height / scale >= 2 * needed.height
     };
     [8, 4, 2].into_iter().find(leaves_enough)
 }
 
-/// Decodes at `1 / scale` of the size: fewer coefficients, fewer pixels, the same picture.
+/// Decodes at `1 / scale` of the size, which needs fewer coefficients and makes fewer pixels.
 fn jpeg_reduced(
     bytes: &[u8],
     size: ImageSize,
     scale: u32,
     config: &ImageConfig,
 ) -> Result<RgbImage, ImageError> {
-    let fail = |error: jpeg_decoder::Error| Format::Jpeg.undecodable(error.to_string());
+    let fail = |error: jpeg_decoder::Error| ImageFormat::Jpeg.undecodable(error.to_string());
+    let limit = usize::try_from(decoded_limit(config)).unwrap_or(usize::MAX);
     let mut decoder = jpeg_decoder::Decoder::new(bytes);
-    decoder
-        .set_max_decoding_buffer_size(usize::try_from(decoded_limit(config)).unwrap_or(usize::MAX));
+    decoder.set_max_decoding_buffer_size(limit);
     decoder.read_info().map_err(fail)?;
-    // A JPEG's sides are 16-bit numbers.
+    // The sides of a JPEG are 16-bit numbers, so the conversion loses nothing.
     let side = |pixels: u32| pixels.div_ceil(scale) as u16;
     let (width, height) = decoder
         .scale(side(size.width), side(size.height))
@@ -138,8 +155,9 @@ fn jpeg_reduced(
         width: u32::from(width),
         height: u32::from(height),
     };
-    if pixels.len() as u64 != u64::from(reduced.width) * u64::from(reduced.height) * 3 {
-        return Err(Format::Jpeg.undecodable("its colours cannot be shown as RGB"));
+    let expected = u64::from(reduced.width) * u64::from(reduced.height) * 3;
+    if pixels.len() as u64 != expected {
+        return Err(ImageFormat::Jpeg.undecodable("its colours cannot be shown as RGB"));
     }
     Ok(RgbImage {
         size: reduced,
@@ -147,44 +165,42 @@ fn jpeg_reduced(
     })
 }
 
-/// The decoder's reason in words for the sender.
+/// The decoder's error in words that the sender of the image understands.
 fn jpeg_reason(error: &DecodeErrors) -> String {
     match error {
-        DecodeErrors::ExhaustedData | DecodeErrors::IoErrors(_) => {
-            "truncated: the bytes end too early".to_owned()
-        }
-        DecodeErrors::FormatStatic("Premature end of buffer") => {
-            "truncated: the bytes end too early".to_owned()
-        }
+        DecodeErrors::ExhaustedData
+        | DecodeErrors::IoErrors(_)
+        | DecodeErrors::FormatStatic("Premature end of buffer") => ENDS_TOO_EARLY.to_owned(),
         DecodeErrors::Format(reason) => reason.clone(),
         DecodeErrors::FormatStatic(reason) => (*reason).to_owned(),
         other => other.to_string(),
     }
 }
 
-fn raster(
-    format: Format,
+/// Checks the limits against the decoder's header, and decodes.
+fn read_pixels(
+    format: ImageFormat,
     decoder: impl ImageDecoder,
     config: &ImageConfig,
 ) -> Result<RgbImage, ImageError> {
     let (width, height) = decoder.dimensions();
     let size = ImageSize { width, height };
     header::check_size(format, size, config)?;
-    if decoder.total_bytes() > decoded_limit(config) {
-        return Err(ImageError::TooDeep {
-            bytes: decoder.total_bytes(),
-            limit: decoded_limit(config),
-        });
+    let bytes = decoder.total_bytes();
+    let limit = decoded_limit(config);
+    if bytes > limit {
+        return Err(ImageError::TooDeep { bytes, limit });
     }
-    let image = DynamicImage::from_decoder(decoder).map_err(|error| image_error(format, &error))?;
+    let image = DynamicImage::from_decoder(decoder);
+    let image = image.map_err(|error| image_error(format, &error))?;
     Ok(RgbImage {
         size,
         pixels: into_rgb(image),
     })
 }
 
-/// 8-bit RGB as Pillow makes it: 16-bit samples keep their high byte, alpha is dropped, grey is
-/// repeated.
+/// The pixels as 8-bit RGB, as Pillow converts them: 16-bit samples keep their high byte, alpha is
+/// dropped, grey is repeated.
 fn into_rgb(image: DynamicImage) -> Vec<u8> {
     let high = |sample: &u16| (sample >> 8) as u8;
     match image {
@@ -208,60 +224,25 @@ fn into_rgb(image: DynamicImage) -> Vec<u8> {
     }
 }
 
-/// What the image crate's decoders report, reduced to the innermost cause.
-fn image_error(format: Format, error: &::image::ImageError) -> ImageError {
-    let mut cause: &dyn std::error::Error = error;
-    let mut ended_early = false;
-    loop {
-        let io = cause.downcast_ref::<std::io::Error>();
-        ended_early |= io.is_some_and(|io| io.kind() == std::io::ErrorKind::UnexpectedEof);
-        match cause.source() {
-            Some(deeper) => cause = deeper,
-            None => break,
-        }
+/// The innermost cause of an error of the image crate, which is the one that says something.
+fn image_error(format: ImageFormat, error: &::image::ImageError) -> ImageError {
+    let mut cause: &(dyn Error + 'static) = error;
+    let mut ended_early = is_unexpected_end(cause);
+    while let Some(deeper) = cause.source() {
+        cause = deeper;
+        ended_early |= is_unexpected_end(cause);
     }
     let reason = cause.to_string();
-    // The PNG decoder reports a missing end as a format error of its own, known only by its text.
+    // The PNG decoder reports a missing end as a format error, which only its text tells apart.
     if ended_early || reason.contains("unexpected end of file") {
-        return format.undecodable("truncated: the bytes end too early");
+        return format.undecodable(ENDS_TOO_EARLY);
     }
     format.undecodable(reason)
 }
 
-/// The size before orientation of an image that is `upright` after it.
-pub(super) fn stored_size(orientation: Orientation, upright: ImageSize) -> ImageSize {
-    match orientation {
-        Orientation::Rotate90
-        | Orientation::Rotate270
-        | Orientation::Rotate90FlipH
-        | Orientation::Rotate270FlipH => ImageSize {
-            width: upright.height,
-            height: upright.width,
-        },
-        _ => upright,
-    }
-}
-
-/// Turns an image upright.
-pub(super) fn apply(orientation: Orientation, image: RgbImage) -> RgbImage {
-    if orientation == Orientation::NoTransforms {
-        return image;
-    }
-    let RgbImage { size, pixels } = image;
-    // The decoders and the resizer always fill width x height x 3 bytes, which is all `from_raw`
-    // asks.
-    let mut image = DynamicImage::ImageRgb8(
-        ::image::RgbImage::from_raw(size.width, size.height, pixels).unwrap_or_default(),
-    );
-    image.apply_orientation(orientation);
-    let size = ImageSize {
-        width: image.width(),
-        height: image.height(),
-    };
-    RgbImage {
-        size,
-        pixels: image.into_rgb8().into_raw(),
-    }
+fn is_unexpected_end(error: &(dyn Error + 'static)) -> bool {
+    let io_error = error.downcast_ref::<io::Error>();
+    io_error.is_some_and(|error| error.kind() == ErrorKind::UnexpectedEof)
 }
 
 #[cfg(test)]
@@ -285,7 +266,7 @@ mod tests {
 
     #[test]
     fn a_panic_becomes_an_error_that_quotes_it() {
-        let error = contained::<()>(|| panic!("index {} out of range", 7)).unwrap_err();
+        let error = catch_panic::<()>(|| panic!("index {} out of range", 7)).unwrap_err();
         assert_eq!(
             error,
             ImageError::DecoderPanicked("index 7 out of range".to_owned())

@@ -1,14 +1,16 @@
-//! RGB images back to bytes: PNG without loss, JPEG for reports and data sets.
+//! Images back to bytes: PNG without loss, JPEG for reports and data sets.
 
-use super::{ImageError, RgbImage};
+use super::error::ImageError;
+use super::rgb::RgbImage;
 use ::image::ExtendedColorType::Rgb8;
 use ::image::ImageEncoder;
 use ::image::codecs::{jpeg::JpegEncoder, png::PngEncoder};
+use placeformer_core::types::ImageSize;
 
-/// Encodes without loss.
+/// Encodes as a PNG, without loss.
 ///
 /// # Errors
-/// An image without pixels, or whose pixels do not fill its size.
+/// [`ImageError::Unencodable`] if the image has no pixels, or not as many as its size says.
 pub fn encode_png(image: &RgbImage) -> Result<Vec<u8>, ImageError> {
     let mut bytes = Vec::new();
     write(image, "PNG", PngEncoder::new(&mut bytes))?;
@@ -18,14 +20,12 @@ pub fn encode_png(image: &RgbImage) -> Result<Vec<u8>, ImageError> {
 /// Encodes as a JPEG of `quality` 1 to 100.
 ///
 /// # Errors
-/// An image without pixels, over 65,535 pixels wide or high, or whose pixels do not fill its size.
+/// [`ImageError::Unencodable`] if the image has no pixels, or not as many as its size says, or a
+/// side of more than 65,535 pixels.
 pub fn encode_jpeg(image: &RgbImage, quality: u8) -> Result<Vec<u8>, ImageError> {
     let mut bytes = Vec::new();
-    write(
-        image,
-        "JPEG",
-        JpegEncoder::new_with_quality(&mut bytes, quality.clamp(1, 100)),
-    )?;
+    let encoder = JpegEncoder::new_with_quality(&mut bytes, quality.clamp(1, 100));
+    write(image, "JPEG", encoder)?;
     Ok(bytes)
 }
 
@@ -35,14 +35,13 @@ fn write(
     encoder: impl ImageEncoder,
 ) -> Result<(), ImageError> {
     let fail = |reason: String| ImageError::Unencodable { format, reason };
-    let (width, height) = (image.size.width, image.size.height);
-    // The encoders assert this; a typed error is kinder than their panic.
-    if image.pixels.is_empty()
-        || image.pixels.len() as u64 != u64::from(width) * u64::from(height) * 3
-    {
+    let ImageSize { width, height } = image.size;
+    let len = image.pixels.len();
+    let expected = u64::from(width) * u64::from(height) * 3;
+    // The encoders would panic.
+    if len == 0 || len as u64 != expected {
         return Err(fail(format!(
-            "{} bytes do not fill {} RGB pixels",
-            image.pixels.len(),
+            "{len} bytes do not fill {} RGB pixels",
             image.size
         )));
     }
@@ -55,7 +54,6 @@ fn write(
 mod tests {
     use super::*;
     use crate::image::{ImageConfig, decode};
-    use placeformer_core::types::ImageSize;
 
     #[test]
     fn png_returns_exactly_and_jpeg_nearly() {
@@ -67,18 +65,13 @@ mod tests {
             .flat_map(|i| [(i % 33 * 7) as u8, (i / 33 * 15) as u8, 90])
             .collect();
         let image = RgbImage { size, pixels };
-        assert_eq!(
-            decode(&encode_png(&image).unwrap(), &ImageConfig::default()).unwrap(),
-            image
-        );
-        let lossy = decode(&encode_jpeg(&image, 95).unwrap(), &ImageConfig::default()).unwrap();
-        assert!(
-            lossy
-                .pixels
-                .iter()
-                .zip(&image.pixels)
-                .all(|(a, b)| a.abs_diff(*b) < 24)
-        );
+        let config = ImageConfig::default();
+        let png = encode_png(&image).unwrap();
+        assert_eq!(decode(&png, &config).unwrap(), image);
+        let jpeg = encode_jpeg(&image, 95).unwrap();
+        let lossy = decode(&jpeg, &config).unwrap();
+        let mut pairs = lossy.pixels.iter().zip(&image.pixels);
+        assert!(pairs.all(|(a, b)| a.abs_diff(*b) < 24));
     }
 
     #[test]

@@ -26,15 +26,18 @@ pub enum ImageError {
         limit: u32,
     },
     /// More pixels than allowed.
-    #[error("the image is {size}, {} pixels; at most {limit} are accepted", u64::from(size.width) * u64::from(size.height))]
+    #[error(
+        "the image is {size}, {} pixels; at most {limit} are accepted",
+        u64::from(size.width) * u64::from(size.height)
+    )]
     TooManyPixels {
         /// Size in the header.
         size: ImageSize,
         /// The limit.
         limit: u64,
     },
-    /// Few enough pixels, but so deep that decoding them would take more memory than the pixel
-    /// limit allows for.
+    /// Not too many pixels, but so many bytes for each that decoding would take more memory than
+    /// the pixel limit allows.
     #[error("decoding the image takes {bytes} bytes; at most {limit} are allowed")]
     TooDeep {
         /// Bytes of the decoded samples.
@@ -48,7 +51,7 @@ pub enum ImageError {
         /// What they look like.
         found: String,
     },
-    /// The bytes begin like an image but cannot be decoded.
+    /// The bytes begin like an image of a known format, but cannot be decoded.
     #[error("the {format} image cannot be decoded: {reason}")]
     Undecodable {
         /// JPEG, PNG or WebP.
@@ -56,10 +59,10 @@ pub enum ImageError {
         /// The cause.
         reason: String,
     },
-    /// The decoder panicked; the bytes are to blame, the process goes on.
+    /// The decoder panicked because of these bytes. Only this request fails.
     #[error("the image cannot be decoded: the decoder failed on it ({0})")]
     DecoderPanicked(String),
-    /// The size asked for is empty.
+    /// The size to resize to has a side of zero pixels.
     #[error("an image cannot be resized to {0}")]
     EmptyTarget(ImageSize),
     /// Encoding failed.
@@ -73,7 +76,7 @@ pub enum ImageError {
 }
 
 impl ImageError {
-    /// The row of the error table.
+    /// The stable code under which clients see it.
     pub fn code(&self) -> ErrorCode {
         match self {
             Self::Empty => ErrorCode::EmptyImage,

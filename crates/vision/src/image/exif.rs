@@ -1,8 +1,7 @@
-//! What a camera wrote beside the pixels: which way is up, and where, whither and when the photo
-//! was taken.
+//! The EXIF data of a photo: which side is up, and where, in which direction and when it was taken.
 //!
-//! EXIF is often missing and often broken, so nothing here fails: a tag that is absent, malformed
-//! or out of range is simply not there.
+//! EXIF data is often missing and often broken, so nothing here fails: a tag that is malformed or
+//! out of range counts as missing.
 
 use ::exif::{Exif, In, Rational, Reader, Tag, Value};
 use ::image::metadata::Orientation;
@@ -11,15 +10,16 @@ use std::io::Cursor;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use time::{Date, Month, OffsetDateTime, PrimitiveDateTime, Time, UtcOffset};
 
-/// Where, whither and when a photo was taken, as far as its EXIF says so.
+/// Where, in which direction and when a photo was taken, as far as its EXIF data says so.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ExifInfo {
-    /// GPS position; none where the receiver marked it void.
+    /// GPS position, unless the receiver marked it as invalid.
     pub location: Option<GeoPoint>,
-    /// Direction the camera faced. A bearing from magnetic north is passed on uncorrected.
+    /// Direction in which the camera looked, in degrees. A bearing from magnetic north is not
+    /// corrected.
     pub heading: Option<Heading>,
-    /// DateTimeOriginal with its UTC offset; without an offset, the GPS clock (which is UTC);
-    /// without that, DateTimeOriginal taken as UTC.
+    /// DateTimeOriginal with its UTC offset. Without an offset it is the GPS time, which is in UTC;
+    /// without that too, DateTimeOriginal is taken as UTC.
     pub captured_at: Option<OffsetDateTime>,
 }
 
@@ -37,17 +37,17 @@ pub fn read_exif(bytes: &[u8]) -> ExifInfo {
 
 /// How the stored pixels must be turned.
 pub(super) fn orientation(bytes: &[u8]) -> Orientation {
-    parse(bytes)
-        .and_then(|exif| {
-            exif.get_field(Tag::Orientation, In::PRIMARY)?
-                .value
-                .get_uint(0)
-        })
-        .and_then(|value| Orientation::from_exif(u8::try_from(value).ok()?))
-        .unwrap_or(Orientation::NoTransforms)
+    stated_orientation(bytes).unwrap_or(Orientation::NoTransforms)
 }
 
-/// The EXIF block, keeping the tags before and after a broken one.
+fn stated_orientation(bytes: &[u8]) -> Option<Orientation> {
+    let exif = parse(bytes)?;
+    let field = exif.get_field(Tag::Orientation, In::PRIMARY)?;
+    let value = u8::try_from(field.value.get_uint(0)?).ok()?;
+    Orientation::from_exif(value)
+}
+
+/// The EXIF data; of a damaged block the tags that can be read.
 fn parse(bytes: &[u8]) -> Option<Exif> {
     let read = || {
         let mut reader = Reader::new();
@@ -57,11 +57,12 @@ fn parse(bytes: &[u8]) -> Option<Exif> {
             .or_else(|error| error.distill_partial_result(|_| {}))
             .ok()
     };
-    // A photo whose EXIF defeats the parser is still a photo.
+    // If the parser panics, the photo itself may still be good.
     catch_unwind(AssertUnwindSafe(read)).ok().flatten()
 }
 
 fn location(exif: &Exif) -> Option<GeoPoint> {
+    // V means void, A active.
     if ascii(exif, Tag::GPSStatus).is_some_and(|status| status.starts_with('V')) {
         return None;
     }
@@ -70,12 +71,15 @@ fn location(exif: &Exif) -> Option<GeoPoint> {
     GeoPoint::new(lat, lon).ok()
 }
 
-/// Degrees, minutes and seconds as signed degrees.
+/// Degrees, minutes and seconds as signed degrees; `negative` is the letter of the negative
+/// hemisphere.
 fn angle(exif: &Exif, value: Tag, reference: Tag, negative: char) -> Option<f64> {
     let parts = rationals(exif, value)?;
-    let [degrees, minutes, seconds] =
-        std::array::from_fn(|i| parts.get(i).map_or(Some(0.0), finite));
-    let magnitude = degrees? + minutes? / 60.0 + seconds? / 3600.0;
+    let part = |i: usize| match parts.get(i) {
+        Some(part) => finite(part),
+        None => Some(0.0),
+    };
+    let magnitude = part(0)? + part(1)? / 60.0 + part(2)? / 3600.0;
     let sign = if ascii(exif, reference)?.starts_with(negative) {
         -1.0
     } else {
@@ -85,7 +89,9 @@ fn angle(exif: &Exif, value: Tag, reference: Tag, negative: char) -> Option<f64>
 }
 
 fn heading(exif: &Exif) -> Option<Heading> {
-    Heading::new(finite(rationals(exif, Tag::GPSImgDirection)?.first()?)?).ok()
+    let values = rationals(exif, Tag::GPSImgDirection)?;
+    let degrees = finite(values.first()?)?;
+    Heading::new(degrees).ok()
 }
 
 fn captured_at(exif: &Exif) -> Option<OffsetDateTime> {
@@ -101,23 +107,23 @@ fn captured_at(exif: &Exif) -> Option<OffsetDateTime> {
 fn local_time(text: &str) -> Option<PrimitiveDateTime> {
     let (day, clock) = text.trim().split_once(' ')?;
     let [hour, minute, second] = numbers(clock)?.map(|number| u8::try_from(number).ok());
-    Some(PrimitiveDateTime::new(
-        date(day)?,
-        Time::from_hms(hour?, minute?, second?).ok()?,
-    ))
+    let time = Time::from_hms(hour?, minute?, second?).ok()?;
+    Some(PrimitiveDateTime::new(date(day)?, time))
 }
 
 /// `YYYY:MM:DD`.
 fn date(text: &str) -> Option<Date> {
     let [year, month, day] = numbers(text)?;
     let month = Month::try_from(u8::try_from(month).ok()?).ok()?;
-    Date::from_calendar_date(i32::from(year), month, u8::try_from(day).ok()?).ok()
+    let day = u8::try_from(day).ok()?;
+    Date::from_calendar_date(i32::from(year), month, day).ok()
 }
 
-/// Three numbers parted by colons (some cameras write dashes).
+/// Three numbers, separated by colons or, as some cameras write them, by dashes.
 fn numbers(text: &str) -> Option<[u16; 3]> {
-    let mut parts = text.trim().split([':', '-']).map(|part| part.parse().ok());
-    Some([parts.next()??, parts.next()??, parts.next()??])
+    let mut parts = text.trim().split([':', '-']);
+    let mut next_number = || parts.next()?.parse().ok();
+    Some([next_number()?, next_number()?, next_number()?])
 }
 
 /// `+HH:MM`, `-HH:MM` or `Z`.
@@ -132,22 +138,23 @@ fn utc_offset(text: &str) -> Option<UtcOffset> {
         _ => return None,
     };
     let (hours, minutes) = clock.split_once(':')?;
-    UtcOffset::from_hms(
-        sign * hours.parse::<i8>().ok()?,
-        sign * minutes.parse::<i8>().ok()?,
-        0,
-    )
-    .ok()
+    let hours: i8 = hours.parse().ok()?;
+    let minutes: i8 = minutes.parse().ok()?;
+    UtcOffset::from_hms(sign * hours, sign * minutes, 0).ok()
 }
 
 fn gps_time(exif: &Exif) -> Option<OffsetDateTime> {
     let day = date(&ascii(exif, Tag::GPSDateStamp)?)?;
     let clock = rationals(exif, Tag::GPSTimeStamp)?;
-    let part = |i: usize| finite(clock.get(i)?).filter(|value| (0.0..60.0).contains(value));
-    let time = Time::from_hms(part(0)? as u8, part(1)? as u8, part(2)? as u8).ok()?;
+    let part = |i: usize| {
+        let value = finite(clock.get(i)?)?;
+        (0.0..60.0).contains(&value).then_some(value as u8)
+    };
+    let time = Time::from_hms(part(0)?, part(1)?, part(2)?).ok()?;
     Some(PrimitiveDateTime::new(day, time).assume_utc())
 }
 
+/// The values of a tag of rational numbers, of which there is at least one.
 fn rationals(exif: &Exif, tag: Tag) -> Option<&[Rational]> {
     match &exif.get_field(tag, In::PRIMARY)?.value {
         Value::Rational(values) if !values.is_empty() => Some(values),
@@ -159,6 +166,7 @@ fn finite(value: &Rational) -> Option<f64> {
     Some(value.to_f64()).filter(|value| value.is_finite())
 }
 
+/// The first line of a text tag.
 fn ascii(exif: &Exif, tag: Tag) -> Option<String> {
     match &exif.get_field(tag, In::PRIMARY)?.value {
         Value::Ascii(lines) => Some(String::from_utf8_lossy(lines.first()?).into_owned()),

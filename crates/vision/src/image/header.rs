@@ -1,22 +1,23 @@
-//! The format from the magic bytes, and the limits from the header.
+//! The format from the magic bytes, and checks of the header before anything is decoded.
 //!
-//! PNG states its size in its first 24 bytes, before any decoder has sized a buffer after it, so it
-//! is read here; the JPEG and WebP decoders parse their headers without allocating by them and are
-//! asked instead.
+//! The PNG decoder allocates buffers according to the size that a file states, so that size is read
+//! here, from the first 24 bytes. The JPEG and WebP decoders read their headers without such
+//! allocations, so they are asked for the size.
 
-use super::{ImageConfig, ImageError};
+use super::config::ImageConfig;
+use super::error::ImageError;
 use placeformer_core::types::ImageSize;
 
-/// A container this service decodes.
+/// An image format that can be decoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Format {
+pub(super) enum ImageFormat {
     Jpeg,
     Png,
     WebP,
 }
 
-impl Format {
-    /// Its name for messages.
+impl ImageFormat {
+    /// Its name in messages.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Jpeg => "JPEG",
@@ -25,7 +26,7 @@ impl Format {
         }
     }
 
-    /// An error of this format.
+    /// The error that an image of this format cannot be decoded.
     pub(super) fn undecodable(self, reason: impl Into<String>) -> ImageError {
         ImageError::Undecodable {
             format: self.name(),
@@ -34,10 +35,12 @@ impl Format {
     }
 }
 
+const JPEG_MAGIC: &[u8] = b"\xff\xd8\xff";
+
 const PNG_MAGIC: &[u8] = b"\x89PNG\r\n\x1a\n";
 
-/// Checks the byte limit and names the format.
-pub(super) fn sniff(bytes: &[u8], config: &ImageConfig) -> Result<Format, ImageError> {
+/// Checks the limit on bytes, and recognises the format.
+pub(super) fn recognise(bytes: &[u8], config: &ImageConfig) -> Result<ImageFormat, ImageError> {
     if bytes.is_empty() {
         return Err(ImageError::Empty);
     }
@@ -47,16 +50,16 @@ pub(super) fn sniff(bytes: &[u8], config: &ImageConfig) -> Result<Format, ImageE
             limit: config.max_bytes,
         });
     }
-    // A file cut inside its magic bytes is a truncated image of that format, not an unknown one;
-    // two bytes are the least that tell anything apart.
-    let begins =
+    // A file that ends within its magic bytes is a truncated image of that format, not one of an
+    // unknown format. A single byte is too little to tell.
+    let begins_with =
         |magic: &[u8]| bytes.len() >= 2 && (bytes.starts_with(magic) || magic.starts_with(bytes));
-    if begins(b"\xff\xd8\xff") {
-        Ok(Format::Jpeg)
-    } else if begins(PNG_MAGIC) {
-        Ok(Format::Png)
-    } else if bytes.len() >= 12 && bytes.starts_with(b"RIFF") && &bytes[8..12] == b"WEBP" {
-        Ok(Format::WebP)
+    if begins_with(JPEG_MAGIC) {
+        Ok(ImageFormat::Jpeg)
+    } else if begins_with(PNG_MAGIC) {
+        Ok(ImageFormat::Png)
+    } else if bytes.starts_with(b"RIFF") && bytes.get(8..12) == Some(b"WEBP") {
+        Ok(ImageFormat::WebP)
     } else {
         Err(ImageError::UnknownFormat {
             found: describe(bytes),
@@ -64,7 +67,7 @@ pub(super) fn sniff(bytes: &[u8], config: &ImageConfig) -> Result<Format, ImageE
     }
 }
 
-/// What bytes that are none of ours look like, for the message.
+/// For the error message: what bytes of an unknown format look like.
 fn describe(bytes: &[u8]) -> String {
     let known: [(&[u8], &str); 7] = [
         (b"GIF8", "they look like a GIF"),
@@ -85,52 +88,49 @@ fn describe(bytes: &[u8]) -> String {
         Some(b"ftypavif") => return "they look like an AVIF".to_owned(),
         _ => {}
     }
-    let head = &bytes[..bytes.len().min(64)];
-    if head
-        .iter()
-        .all(|byte| byte.is_ascii_graphic() || byte.is_ascii_whitespace())
-    {
+    let start = &bytes[..bytes.len().min(64)];
+    let is_text = |byte: &u8| byte.is_ascii_graphic() || byte.is_ascii_whitespace();
+    if start.iter().all(is_text) {
         return "they look like text".to_owned();
     }
-    let hex: Vec<String> = head
-        .iter()
-        .take(8)
-        .map(|byte| format!("{byte:02x}"))
-        .collect();
+    let first = start.iter().take(8);
+    let hex: Vec<String> = first.map(|byte| format!("{byte:02x}")).collect();
     format!("they begin with {}", hex.join(" "))
 }
 
 /// The size in a PNG's IHDR chunk.
 pub(super) fn png_size(bytes: &[u8]) -> Result<ImageSize, ImageError> {
-    let truncated = || Format::Png.undecodable("truncated inside the header");
-    if bytes.get(12..16).ok_or_else(truncated)? != b"IHDR" {
-        return Err(Format::Png.undecodable("the first chunk is not IHDR"));
+    let truncated = || ImageFormat::Png.undecodable("truncated inside the header");
+    let chunk = four_bytes(bytes, 12).ok_or_else(truncated)?;
+    if &chunk != b"IHDR" {
+        return Err(ImageFormat::Png.undecodable("the first chunk is not IHDR"));
     }
-    let side = |at: usize| {
-        let field = bytes
-            .get(at..at + 4)
-            .and_then(|field| <[u8; 4]>::try_from(field).ok());
-        field.map(u32::from_be_bytes).ok_or_else(truncated)
-    };
+    let width = four_bytes(bytes, 16).ok_or_else(truncated)?;
+    let height = four_bytes(bytes, 20).ok_or_else(truncated)?;
     Ok(ImageSize {
-        width: side(16)?,
-        height: side(20)?,
+        width: u32::from_be_bytes(width),
+        height: u32::from_be_bytes(height),
     })
 }
 
-/// Whether a WebP holds all the bytes that its RIFF header states; a lossless one cut short decodes
-/// as corrupt at best.
+/// Whether a WebP has all the bytes that its RIFF header states. The decoder would at best report a
+/// truncated file as corrupt.
 pub(super) fn webp_is_complete(bytes: &[u8]) -> bool {
-    let stated = bytes
-        .get(4..8)
-        .and_then(|field| <[u8; 4]>::try_from(field).ok())
-        .map(u32::from_le_bytes);
-    stated.is_some_and(|stated| bytes.len() as u64 >= u64::from(stated) + 8)
+    let Some(stated) = four_bytes(bytes, 4) else {
+        return false;
+    };
+    // The length counts what follows it, and eight bytes come before.
+    let end = u64::from(u32::from_le_bytes(stated)) + 8;
+    bytes.len() as u64 >= end
 }
 
-/// Checks a header's size against the limits.
+fn four_bytes(bytes: &[u8], at: usize) -> Option<[u8; 4]> {
+    bytes.get(at..)?.first_chunk().copied()
+}
+
+/// Checks the size that a header states against the limits.
 pub(super) fn check_size(
-    format: Format,
+    format: ImageFormat,
     size: ImageSize,
     config: &ImageConfig,
 ) -> Result<(), ImageError> {
@@ -152,50 +152,64 @@ pub(super) fn check_size(
     Ok(())
 }
 
-/// Most scans of a JPEG. Cameras and encoders write one to about ten; each costs a pass over the
-/// whole picture, however few bytes it has, so a file of a few megabytes could otherwise keep a
-/// decoder busy for hours.
+/// Most scans of a JPEG. Cameras and encoders write one to about ten. Each scan costs the decoder a
+/// pass over the whole picture, however few bytes it has, so without a limit a file of a few
+/// megabytes could keep it busy for hours.
 pub(super) const MAX_JPEG_SCANS: usize = 100;
 
-/// Checks that a JPEG's last scan is followed by an end-of-image marker, and that it has no absurd
-/// number of scans.
+/// Checks that a JPEG ends with an end-of-image marker, and that it does not have too many scans.
 ///
-/// Decoders paint what is missing grey; half a picture would match half a place, so a file without
-/// its end is refused. Entropy-coded data never holds `FF` before anything but `00` or a restart
-/// marker, so the end is found by walking the segments, as the decoders do. Bytes after it (a
-/// second picture, a maker's appendix) do not matter.
+/// Decoders fill what is missing of a picture with grey. Half a picture would match half of a
+/// place, so a file without its end is refused. To find the end, the segments are walked as
+/// decoders walk them; that is possible because compressed data has `FF` only before `00` or a
+/// restart marker. Bytes after the end are ignored: cameras append second pictures and data of
+/// their own.
 pub(super) fn check_jpeg(bytes: &[u8]) -> Result<(), ImageError> {
-    let truncated = || Format::Jpeg.undecodable("truncated: the end-of-image marker is missing");
-    let (mut at, mut scans) = (2, 0);
+    let mut scans = 0;
+    // The first two bytes are the start-of-image marker.
+    let mut at = 2;
     while at + 1 < bytes.len() {
         if bytes[at] != 0xff {
-            at += bytes[at..]
-                .iter()
-                .position(|&byte| byte == 0xff)
-                .ok_or_else(truncated)?;
+            let to_marker = bytes[at..].iter().position(|&byte| byte == 0xff);
+            at += to_marker.ok_or_else(truncated_jpeg)?;
             continue;
         }
         match bytes[at + 1] {
-            0xd9 => return Ok(()),
-            // Stuffing, restarts and stand-alone markers carry no length; a second FF is padding.
+            END_OF_IMAGE => return Ok(()),
+            // An escaped FF, restart markers, and other markers without a length.
             0x00 | 0x01 | 0xd0..=0xd8 => at += 2,
+            // Padding before a marker.
             0xff => at += 1,
             marker => {
-                let length = bytes.get(at + 2..at + 4).ok_or_else(truncated)?;
-                let length = usize::from(u16::from_be_bytes([length[0], length[1]]));
-                scans += usize::from(marker == 0xda);
+                let length = segment_length(bytes, at + 2)?;
+                scans += usize::from(marker == START_OF_SCAN);
                 if scans > MAX_JPEG_SCANS {
-                    return Err(Format::Jpeg
-                        .undecodable(format!("it has more than {MAX_JPEG_SCANS} scans")));
+                    let reason = format!("it has more than {MAX_JPEG_SCANS} scans");
+                    return Err(ImageFormat::Jpeg.undecodable(reason));
                 }
+                // The length counts its own two bytes, so it cannot be less. Decoders accept that
+                // after the first scan.
                 if length < 2 && scans == 0 {
-                    return Err(truncated());
+                    return Err(truncated_jpeg());
                 }
                 at += 2 + length;
             }
         }
     }
-    Err(truncated())
+    Err(truncated_jpeg())
+}
+
+const START_OF_SCAN: u8 = 0xda;
+const END_OF_IMAGE: u8 = 0xd9;
+
+fn truncated_jpeg() -> ImageError {
+    ImageFormat::Jpeg.undecodable("truncated: the end-of-image marker is missing")
+}
+
+fn segment_length(bytes: &[u8], at: usize) -> Result<usize, ImageError> {
+    let field = bytes.get(at..).and_then(|rest| rest.first_chunk());
+    let field = field.ok_or_else(truncated_jpeg)?;
+    Ok(usize::from(u16::from_be_bytes(*field)))
 }
 
 #[cfg(test)]
@@ -205,7 +219,7 @@ mod tests {
     #[test]
     fn other_formats_are_named() {
         let config = ImageConfig::default();
-        let found = |bytes: &[u8]| match sniff(bytes, &config) {
+        let found = |bytes: &[u8]| match recognise(bytes, &config) {
             Err(ImageError::UnknownFormat { found }) => found,
             other => panic!("{other:?}"),
         };

@@ -1,7 +1,8 @@
-//! Antialiased squash resize and ImageNet normalisation, as torchvision does them on a Pillow
-//! image.
+//! Antialiased resizing without keeping the aspect ratio, and ImageNet normalisation, both as
+//! torchvision does them on a Pillow image.
 
-use super::{ImageError, RgbImage};
+use super::error::ImageError;
+use super::rgb::RgbImage;
 use fast_image_resize::images::{Image, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
 use placeformer_core::types::{ImageSize, ImageTensor};
@@ -11,7 +12,21 @@ pub const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 /// ImageNet standard deviation of R, G, B.
 pub const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
 
-/// Squashes `image` to `size`: bilinear, its support widened by the reduction (Pillow's BILINEAR).
+impl RgbImage {
+    /// The same image at another size, with an antialiased bilinear filter.
+    ///
+    /// # Errors
+    /// [`ImageError::EmptyTarget`] if a side of `size` is zero.
+    pub fn resized(&self, size: ImageSize) -> Result<Self, ImageError> {
+        resize(self, size)
+    }
+}
+
+/// Resizes `image` to `size` with Pillow's BILINEAR filter: its support grows with the reduction,
+/// so that every pixel of the source counts.
+///
+/// # Errors
+/// [`ImageError::EmptyTarget`] if a side of `size` is zero.
 pub(super) fn resize(image: &RgbImage, size: ImageSize) -> Result<RgbImage, ImageError> {
     if size.width == 0 || size.height == 0 {
         return Err(ImageError::EmptyTarget(size));
@@ -19,14 +34,9 @@ pub(super) fn resize(image: &RgbImage, size: ImageSize) -> Result<RgbImage, Imag
     if image.size == size {
         return Ok(image.clone());
     }
-    let failed = |_| ImageError::EmptyTarget(size);
-    let source = ImageRef::new(
-        image.size.width,
-        image.size.height,
-        &image.pixels,
-        PixelType::U8x3,
-    )
-    .map_err(failed)?;
+    let ImageSize { width, height } = image.size;
+    let source = ImageRef::new(width, height, &image.pixels, PixelType::U8x3)
+        .map_err(|_| ImageError::EmptyTarget(size))?;
     let mut small = Image::new(size.width, size.height, PixelType::U8x3);
     let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Bilinear));
     Resizer::new()
@@ -38,11 +48,12 @@ pub(super) fn resize(image: &RgbImage, size: ImageSize) -> Result<RgbImage, Imag
     })
 }
 
-/// `[height, width, 3]` bytes to `[3, height, width]` f32: `(value / 255 - mean) / deviation`.
+/// Bytes `[height, width, 3]` to floats `[3, height, width]`: `(value / 255 - mean) / deviation`.
 pub(super) fn normalise(image: &RgbImage) -> ImageTensor {
     let area = image.pixels.len() / 3;
     let mut data = vec![0f32; area * 3];
     for (channel, plane) in data.chunks_exact_mut(area.max(1)).enumerate() {
+        // A byte has only 256 values, so the formula is evaluated once for each.
         let table: [f32; 256] = std::array::from_fn(|value| {
             (value as f32 / 255.0 - MEAN[channel]) / DEVIATION[channel]
         });
@@ -89,22 +100,19 @@ mod tests {
             width: 64,
             height: 8,
         };
-        let stripes = (0..64 * 8)
-            .flat_map(|i| [if i % 2 == 0 { 0u8 } else { 255 }; 3])
-            .collect();
-        let small = resize(
-            &RgbImage {
-                size,
-                pixels: stripes,
-            },
-            ImageSize {
-                width: 8,
-                height: 8,
-            },
-        )
-        .unwrap();
+        let grey = |i: usize| if i.is_multiple_of(2) { 0u8 } else { 255 };
+        let stripes = RgbImage {
+            size,
+            pixels: (0..64 * 8).flat_map(|i| [grey(i); 3]).collect(),
+        };
+        let target = ImageSize {
+            width: 8,
+            height: 8,
+        };
+        let small = resize(&stripes, target).unwrap();
+        let is_grey = |value: &u8| (110..=145).contains(value);
         assert!(
-            small.pixels.iter().all(|value| (110..=145).contains(value)),
+            small.pixels.iter().all(is_grey),
             "{:?}",
             &small.pixels[..24]
         );

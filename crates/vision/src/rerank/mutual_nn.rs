@@ -1,9 +1,10 @@
-//! Mutual nearest neighbours of two images' key patches (paper III-D, step 6).
+//! Mutual nearest neighbours of the key patches of two images (paper III-D, step 6).
 //!
-//! Descriptors are L2-normalised, so the nearest by Euclidean distance is the one of the largest
-//! dot product. The similarity of each pair of scales is computed once
-//! ([`placeformer_kernels::similarity`]), however many of the configured unions contain it; a union then
-//! takes the best over its blocks.
+//! Descriptors are L2-normalised, so the nearest one by Euclidean distance is the one with the
+//! largest dot product. Several of the configured combinations may contain the same pair of scales.
+//! So the dot products of each pair of scales are computed only once
+//! ([`placeformer_kernels::similarity`]), and a combination takes the best over its pairs of
+//! scales.
 
 use placeformer_core::types::{PackedPatches, SCALES, ScaleSet};
 use placeformer_kernels::Simd;
@@ -11,15 +12,15 @@ use placeformer_kernels::similarity::{
     self, Best, BlockMaxima, Blocks, Int8Descriptors, PackedColumns,
 };
 
-/// A mutual pair: row in the query's patches, row in the reference's.
+/// A mutual pair: the row in the query's patches, and the row in the reference's.
 pub(super) type Pair = (u32, u32);
 
-/// The query's side, laid out once and compared with every candidate.
+/// The patches of a query, laid out once and compared with every candidate.
 #[derive(Debug)]
 pub(super) struct PreparedQuery {
     columns: PackedColumns,
     counts: [usize; SCALES],
-    /// Centres of the patches, in pixels of the model's input.
+    /// Centres of the patches in pixels of the model's input.
     pub(super) centres: Vec<[f32; 2]>,
 }
 
@@ -36,7 +37,7 @@ impl PreparedQuery {
         self.columns.simd()
     }
 
-    /// Replaces the query; the memory of the one before is used again.
+    /// Replaces the query. The memory of the one before is used again.
     pub(super) fn prepare(&mut self, query: &PackedPatches) {
         self.columns.pack(quantised(query));
         self.counts = query.counts;
@@ -44,15 +45,13 @@ impl PreparedQuery {
     }
 }
 
-/// Centres of all patches, in pixels of the model's input.
+/// Replaces `out` by the centres of all patches, in pixels of the model's input.
 pub(super) fn centres_of(patches: &PackedPatches, out: &mut Vec<[f32; 2]>) {
     out.clear();
     for scale in 1..=SCALES {
-        out.extend(
-            patches
-                .rows(scale)
-                .map(|row| patches.grid.centre(scale, patches.index[row] as usize)),
-        );
+        for &index in &patches.index[patches.rows(scale)] {
+            out.push(patches.grid.centre(scale, usize::from(index)));
+        }
     }
 }
 
@@ -73,25 +72,27 @@ pub(super) struct Matcher {
 }
 
 impl Matcher {
-    /// Computes the best partners within every pair of scales that `combinations` need.
+    /// Computes the best partner of every patch within every pair of scales that `combinations`
+    /// need.
     pub(super) fn compare(
         &mut self,
         query: &PreparedQuery,
         reference: &PackedPatches,
         combinations: &[ScaleSet],
     ) {
-        let wanted = blocks_of(combinations);
+        let needed = scale_pairs_of(combinations);
         similarity::block_maxima(
             &query.columns,
             quantised(reference),
-            &wanted,
+            &needed,
             &mut self.scratch,
             &mut self.maxima,
         );
     }
 
-    /// The mutual pairs of one union, ascending by query row, from the last comparison, which must
-    /// have covered it.
+    /// Replaces `pairs` by the mutual pairs of one combination, ascending by query row.
+    ///
+    /// They are those of the last [`Self::compare`], which must have been given this combination.
     pub(super) fn mutual_pairs(
         &self,
         query: &PreparedQuery,
@@ -104,9 +105,12 @@ impl Matcher {
             let start: usize = query.counts[..scale - 1].iter().sum();
             for row in start..start + query.counts[scale - 1] {
                 let nearest = best_over(&self.maxima.columns, scales, row).index;
-                if (nearest as usize) < reference.len()
-                    && best_over(&self.maxima.rows, scales, nearest as usize).index == row as u32
-                {
+                if nearest as usize >= reference.len() {
+                    // The reference has no patches of these scales.
+                    continue;
+                }
+                let back = best_over(&self.maxima.rows, scales, nearest as usize).index;
+                if back == row as u32 {
                     pairs.push((row as u32, nearest));
                 }
             }
@@ -114,8 +118,8 @@ impl Matcher {
     }
 }
 
-/// The pairs of scales that occur together in some union.
-fn blocks_of(combinations: &[ScaleSet]) -> Blocks {
+/// The pairs of scales that occur together in some combination.
+fn scale_pairs_of(combinations: &[ScaleSet]) -> Blocks {
     let together = |a: usize, b: usize| {
         combinations
             .iter()
@@ -124,8 +128,8 @@ fn blocks_of(combinations: &[ScaleSet]) -> Blocks {
     std::array::from_fn(|a| std::array::from_fn(|b| together(a + 1, b + 1)))
 }
 
-/// The best partner of `row` among the scales of a union; scales ascend, so a tie goes to the
-/// lowest index.
+/// The best partner of `row` among the scales of a combination. The scales ascend, so of equally
+/// good partners the one with the lowest index wins.
 fn best_over(bests: &[Vec<Best>; SCALES], scales: ScaleSet, row: usize) -> Best {
     let mut best = Best::NONE;
     for scale in scales.scales() {

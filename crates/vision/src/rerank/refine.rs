@@ -1,83 +1,99 @@
 //! Least-squares refinement of a homography on the correspondences near it.
 //!
-//! A homography through four patch centres inherits their quantisation to the patch grid. Fitting
-//! all correspondences within reach evens that out, and usually gains inliers. The algebraic
-//! residuals are divided by the previous estimate's `w`, which makes them the transfer error that
-//! inliers are judged by.
+//! A homography through four patch centres is as inexact as the patch grid. A fit of all
+//! correspondences near it averages the errors of the grid, and usually gains inliers. The quantity
+//! that the fit minimises is algebraic; dividing each residual by the `w` of the previous estimate
+//! turns it into the transfer error by which inliers are judged.
 
 use nalgebra::{SMatrix, SVector};
 use placeformer_kernels::homography::PointPairs;
 
+/// Fewest correspondences for a fit. Four determine a homography exactly, and leave nothing to
+/// average.
+const LEAST_PAIRS: usize = 5;
+
 /// Fits the correspondences whose transfer error under `homography` is within `radius` tolerances.
+/// The points are normalised, so that the tolerance is 1. The last entry of `homography` is 1, and
+/// so is that of the result, which is row-major too.
 ///
-/// Row-major, last entry 1 on return. `None` where fewer than five are in reach, or they do not
-/// determine a homography that keeps orientation and has the origin (their common centre) in front.
+/// `None` if fewer than five correspondences are near, or they do not determine a homography that
+/// keeps the orientation and has the origin, which is their common centre, in front of the camera.
 pub(super) fn refit(pairs: &PointPairs, homography: &[f64; 9], radius: f64) -> Option<[f64; 9]> {
-    let mut sums = Sums::default();
+    let mut moments = Moments::default();
     for i in 0..pairs.len() {
         let pair = pairs.get(i).map(f64::from);
-        if let Some(w) = reach(homography, pair, radius) {
-            sums.add(pair, 1.0 / (w * w));
+        if let Some(w) = w_if_near(homography, pair, radius) {
+            moments.add(pair, 1.0 / (w * w));
         }
     }
-    if sums.count < 5 {
-        None
-    } else {
-        sums.solve().filter(keeps_orientation)
+    if moments.count < LEAST_PAIRS {
+        return None;
     }
+    moments.solve().filter(keeps_orientation)
 }
 
-/// The `w` of a correspondence under `homography` (scaled to a last entry of 1) if its error is
-/// within `radius`.
-fn reach(homography: &[f64; 9], [x, y, u, v]: [f64; 4], radius: f64) -> Option<f64> {
+/// The `w` of a correspondence under `homography`, scaled to a last entry of 1, if its transfer
+/// error is within `radius`.
+fn w_if_near(homography: &[f64; 9], [x, y, u, v]: [f64; 4], radius: f64) -> Option<f64> {
     let [a, b, c, d, e, f, g, h, i] = *homography;
     let w = g * x + h * y + i;
-    let (dx, dy) = (a * x + b * y + c - u * w, d * x + e * y + f - v * w);
-    (w > 0.0 && dx * dx + dy * dy <= radius * radius * w * w).then_some(w / i)
+    // The error times w, which saves the divisions.
+    let dx = a * x + b * y + c - u * w;
+    let dy = d * x + e * y + f - v * w;
+    let is_near = w > 0.0 && dx * dx + dy * dy <= radius * radius * w * w;
+    is_near.then_some(w / i)
 }
 
+/// Whether the determinant is positive.
 fn keeps_orientation(homography: &[f64; 9]) -> bool {
     let [a, b, c, d, e, f, g, h, i] = *homography;
     a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
 }
 
-/// Moments of the correspondences from which the normal equations are assembled.
+/// The weighted sums of products of coordinates from which the normal equations are assembled.
 #[derive(Default)]
-struct Sums {
+struct Moments {
+    /// Number of correspondences.
     count: usize,
-    /// Each of 1, u, v and u^2 + v^2 times each of xx, xy, yy, x, y, 1.
-    moments: [[f64; 6]; 4],
+    /// For each of the factors 1, u, v and u^2 + v^2: its products with xx, xy, yy, x, y and 1.
+    sums: [[f64; 6]; 4],
 }
 
-impl Sums {
+/// Where the products of x, y and 1 with each other are among the six.
+const PRODUCT: [[usize; 3]; 3] = [[0, 1, 3], [1, 2, 4], [3, 4, 5]];
+
+impl Moments {
     fn add(&mut self, [x, y, u, v]: [f64; 4], weight: f64) {
         self.count += 1;
         let monomials = [x * x, x * y, y * y, x, y, 1.0].map(|monomial| weight * monomial);
-        for (moments, factor) in self.moments.iter_mut().zip([1.0, u, v, u * u + v * v]) {
-            moments
-                .iter_mut()
-                .zip(monomials)
-                .for_each(|(moment, monomial)| *moment += factor * monomial);
+        let factors = [1.0, u, v, u * u + v * v];
+        for (sums, factor) in self.sums.iter_mut().zip(factors) {
+            for (sum, monomial) in sums.iter_mut().zip(monomials) {
+                *sum += factor * monomial;
+            }
         }
     }
 
-    /// Minimises the weighted residuals of `a x + b y + c - u (g x + h y) = u` and its like for
-    /// `v`.
+    /// The homography with last entry 1 that minimises the weighted squares of the residuals of
+    /// `a x + b y + c - u (g x + h y) = u` and `d x + e y + f - v (g x + h y) = v`.
     fn solve(&self) -> Option<[f64; 9]> {
-        let [plain, by_u, by_v, by_square] = &self.moments;
-        // Positions of the products of x, y and 1 within a row of moments.
-        const PRODUCT: [[usize; 3]; 3] = [[0, 1, 3], [1, 2, 4], [3, 4, 5]];
+        let [plain, by_u, by_v, by_square] = &self.sums;
+        // The unknowns are a, b, c (rows 0 to 2), d, e, f (3 to 5), g and h (6 and 7).
         let mut normal = SMatrix::<f64, 8, 8>::zeros();
         let mut right = SVector::<f64, 8>::zeros();
         for row in 0..3 {
             for column in 0..3 {
-                normal[(row, column)] = plain[PRODUCT[row][column]];
-                normal[(3 + row, 3 + column)] = plain[PRODUCT[row][column]];
+                let product = plain[PRODUCT[row][column]];
+                normal[(row, column)] = product;
+                normal[(3 + row, 3 + column)] = product;
             }
             for column in 0..2 {
-                let (u, v) = (-by_u[PRODUCT[row][column]], -by_v[PRODUCT[row][column]]);
-                (normal[(row, 6 + column)], normal[(6 + column, row)]) = (u, u);
-                (normal[(3 + row, 6 + column)], normal[(6 + column, 3 + row)]) = (v, v);
+                let u = -by_u[PRODUCT[row][column]];
+                let v = -by_v[PRODUCT[row][column]];
+                normal[(row, 6 + column)] = u;
+                normal[(6 + column, row)] = u;
+                normal[(3 + row, 6 + column)] = v;
+                normal[(6 + column, 3 + row)] = v;
             }
             right[row] = by_u[PRODUCT[row][2]];
             right[3 + row] = by_v[PRODUCT[row][2]];
@@ -88,12 +104,12 @@ impl Sums {
             }
             right[6 + row] = -by_square[PRODUCT[row][2]];
         }
+
         let solution = normal.cholesky()?.solve(&right);
-        let homography = std::array::from_fn(|i| if i < 8 { solution[i] } else { 1.0 });
-        homography
-            .iter()
-            .all(|entry| entry.is_finite())
-            .then_some(homography)
+        let mut homography = [1.0; 9];
+        homography[..8].copy_from_slice(solution.as_slice());
+        let is_finite = homography.iter().all(|entry| entry.is_finite());
+        is_finite.then_some(homography)
     }
 }
 
@@ -106,40 +122,30 @@ mod tests {
     fn grid(noise: f64) -> PointPairs {
         let mut pairs = PointPairs::default();
         pairs.fill((0..64).map(|i| {
-            let (x, y) = ((i % 8) as f64 * 4.0 - 14.0, (i / 8) as f64 * 3.0 - 11.0);
+            let x = (i % 8) as f64 * 4.0 - 14.0;
+            let y = (i / 8) as f64 * 3.0 - 11.0;
             let at = |row: usize| TRUE[row] * x + TRUE[row + 1] * y + TRUE[row + 2];
-            let wobble = |k: f64| noise * (i as f64 * k).sin();
-            [
-                x,
-                y,
-                at(0) / at(6) + wobble(1.7),
-                at(3) / at(6) + wobble(2.9),
-            ]
-            .map(|value| value as f32)
+            let wave = |k: f64| noise * (i as f64 * k).sin();
+            let u = at(0) / at(6) + wave(1.7);
+            let v = at(3) / at(6) + wave(2.9);
+            [x, y, u, v].map(|value| value as f32)
         }));
         pairs
     }
 
+    fn is_true_within(homography: &[f64; 9], bound: f64) -> bool {
+        let mut pairs = homography.iter().zip(TRUE);
+        pairs.all(|(ours, truth)| (ours - truth).abs() < bound)
+    }
+
     #[test]
-    fn the_truth_is_a_fixed_point_and_noise_is_evened_out() {
+    fn the_truth_is_a_fixed_point_and_noise_is_averaged_out() {
         let exact = refit(&grid(0.0), &TRUE, 1.0).unwrap();
-        assert!(
-            exact
-                .iter()
-                .zip(TRUE)
-                .all(|(ours, truth)| (ours - truth).abs() < 1e-4),
-            "{exact:?}"
-        );
+        assert!(is_true_within(&exact, 1e-4), "{exact:?}");
         let mut start = TRUE;
         start[2] += 0.3;
         let noisy = refit(&grid(0.3), &start, 1.0).unwrap();
-        assert!(
-            noisy
-                .iter()
-                .zip(TRUE)
-                .all(|(ours, truth)| (ours - truth).abs() < 0.1),
-            "{noisy:?}"
-        );
+        assert!(is_true_within(&noisy, 0.1), "{noisy:?}");
     }
 
     #[test]

@@ -1,19 +1,22 @@
 //! The score of a pair of images (paper III-E, step 8): S adds up the inliers of every configured
-//! union of scales.
+//! combination of scales.
 
+use super::config::RerankConfig;
 use super::mutual_nn::{Matcher, Pair, PreparedQuery, centres_of};
+use super::outcome::{CombinationMatch, CombinationScore, Correspondence, PairScore};
 use super::ransac::{Estimate, Ransac, RansacSettings, is_inlier};
-use super::{CombinationMatch, CombinationScore, Correspondence, PairScore, RerankConfig};
 use placeformer_core::types::{PackedPatches, ScaleSet};
 use placeformer_kernels::Simd;
 use std::cell::RefCell;
 
-/// What one thread needs to score a pair; kept from pair to pair.
+/// The memory that one thread needs to score a pair of images; kept from pair to pair.
 #[derive(Debug, Default)]
 pub(super) struct Workspace {
     matcher: Matcher,
     ransac: Ransac,
+    /// Mutual pairs of the combination at hand.
     pairs: Vec<Pair>,
+    /// Centres of the reference's patches, in pixels.
     centres: Vec<[f32; 2]>,
 }
 
@@ -22,15 +25,16 @@ thread_local! {
     static PREPARED: RefCell<Vec<PreparedQuery>> = const { RefCell::new(Vec::new()) };
 }
 
-/// Lends this thread's workspace.
+/// Calls `work` with this thread's workspace.
 pub(super) fn with_workspace<T>(work: impl FnOnce(&mut Workspace) -> T) -> T {
     WORKSPACE.with_borrow_mut(work)
 }
 
-/// Prepares `query` in memory this thread kept from an earlier one, and lends it.
+/// Prepares `query`, in memory that this thread has kept from an earlier query, and calls `work`
+/// with it.
 ///
-/// The memory is taken out meanwhile: while `work` waits for other threads, this one may be given
-/// another query.
+/// The memory is taken out of the thread-local variable for that time: while `work` waits for other
+/// threads, this thread may be given another query to prepare.
 pub(super) fn with_prepared<T>(
     simd: Simd,
     query: &PackedPatches,
@@ -59,20 +63,19 @@ impl Workspace {
     ) -> PairScore {
         self.compare(config, query, reference);
         let mut combinations = Vec::with_capacity(config.scales.len());
+        let mut spatial_score = 0;
         for &scales in &config.scales {
             let (score, _) = self.verify(simd, config, query, reference, scales);
+            spatial_score += score.inliers;
             combinations.push(score);
         }
         PairScore {
-            spatial_score: combinations
-                .iter()
-                .map(|combination| combination.inliers)
-                .sum(),
+            spatial_score,
             combinations,
         }
     }
 
-    /// Scores one reference and keeps who matched whom.
+    /// Scores one reference and returns which patches matched.
     pub(super) fn explain(
         &mut self,
         simd: Simd,
@@ -81,26 +84,29 @@ impl Workspace {
         reference: &PackedPatches,
     ) -> Vec<CombinationMatch> {
         self.compare(config, query, reference);
-        let one = |&scales: &ScaleSet| {
+        let tolerance_px = tolerance_px(config, reference);
+        let mut matches = Vec::with_capacity(config.scales.len());
+        for &scales in &config.scales {
             let (score, estimate) = self.verify(simd, config, query, reference, scales);
-            let tolerance_px = tolerance_px(config, reference);
-            let correspondences = self.pairs.iter().map(|&pair| Correspondence {
-                query: pair.0,
-                reference: pair.1,
-                inlier: estimate.is_some_and(|found| {
-                    is_inlier(&found.homography, self.points(query, pair), tolerance_px)
-                }),
-            });
-            CombinationMatch {
+            let to_correspondence = |&pair: &Pair| {
+                let points = points_of(&query.centres, &self.centres, pair);
+                Correspondence {
+                    query: pair.0,
+                    reference: pair.1,
+                    inlier: estimate
+                        .is_some_and(|found| is_inlier(&found.homography, points, tolerance_px)),
+                }
+            };
+            matches.push(CombinationMatch {
                 score,
-                correspondences: correspondences.collect(),
-                homography: estimate.map(|found| scaled(found.homography)),
-            }
-        };
-        config.scales.iter().map(one).collect()
+                correspondences: self.pairs.iter().map(to_correspondence).collect(),
+                homography: estimate.map(|found| with_last_entry_one(found.homography)),
+            });
+        }
+        matches
     }
 
-    /// Verifies correspondences that were found otherwise.
+    /// The homography of correspondences (`x, y, u, v` in pixels) that were found in another way.
     pub(super) fn homography(
         &mut self,
         simd: Simd,
@@ -108,28 +114,19 @@ impl Workspace {
         correspondences: &[[f32; 4]],
         tolerance_px: f32,
     ) -> Option<([f64; 9], u32)> {
-        let RerankConfig {
-            max_iterations,
-            confidence,
-            ..
-        } = *config;
-        let settings = RansacSettings {
-            tolerance_px,
-            max_iterations,
-            confidence,
-        };
-        let estimate = self
-            .ransac
-            .estimate(simd, correspondences.iter().copied(), &settings)?;
-        Some((scaled(estimate.homography), estimate.inliers))
+        let settings = ransac_settings(config, tolerance_px);
+        let correspondences = correspondences.iter().copied();
+        let estimate = self.ransac.estimate(simd, correspondences, &settings)?;
+        Some((with_last_entry_one(estimate.homography), estimate.inliers))
     }
 
+    /// Compares all patches of the two images, as all combinations need it.
     fn compare(&mut self, config: &RerankConfig, query: &PreparedQuery, reference: &PackedPatches) {
         self.matcher.compare(query, reference, &config.scales);
         centres_of(reference, &mut self.centres);
     }
 
-    /// Leaves the mutual pairs of one union in `self.pairs`.
+    /// Scores one combination. Its mutual pairs remain in `self.pairs`.
     fn verify(
         &mut self,
         simd: Simd,
@@ -140,50 +137,43 @@ impl Workspace {
     ) -> (CombinationScore, Option<Estimate>) {
         self.matcher
             .mutual_pairs(query, reference, scales, &mut self.pairs);
-        let settings = RansacSettings {
-            tolerance_px: tolerance_px(config, reference),
-            max_iterations: config.max_iterations,
-            confidence: config.confidence,
-        };
-        let Self {
-            ransac,
-            pairs,
-            centres,
-            ..
-        } = self;
-        let points = pairs
+        let settings = ransac_settings(config, tolerance_px(config, reference));
+        let points = self
+            .pairs
             .iter()
-            .map(|&pair| points_of(&query.centres, centres, pair));
-        let estimate = ransac.estimate(simd, points, &settings);
-        let inliers = estimate.map_or(0, |found| found.inliers);
-        (
-            CombinationScore {
-                scales,
-                matches: self.pairs.len() as u32,
-                inliers,
-            },
-            estimate,
-        )
-    }
-
-    fn points(&self, query: &PreparedQuery, pair: Pair) -> [f32; 4] {
-        points_of(&query.centres, &self.centres, pair)
+            .map(|&pair| points_of(&query.centres, &self.centres, pair));
+        let estimate = self.ransac.estimate(simd, points, &settings);
+        let score = CombinationScore {
+            scales,
+            matches: self.pairs.len() as u32,
+            inliers: estimate.map_or(0, |found| found.inliers),
+        };
+        (score, estimate)
     }
 }
 
-/// Centres of a pair: x, y in the query, u, v in the reference.
-fn points_of(query: &[[f32; 2]], reference: &[[f32; 2]], (i, j): Pair) -> [f32; 4] {
-    let ([x, y], [u, v]) = (query[i as usize], reference[j as usize]);
+/// The centres of a pair: x, y in the query, u, v in the reference, in pixels.
+fn points_of(query: &[[f32; 2]], reference: &[[f32; 2]], pair: Pair) -> [f32; 4] {
+    let [x, y] = query[pair.0 as usize];
+    let [u, v] = reference[pair.1 as usize];
     [x, y, u, v]
 }
 
-/// The base patch's size counts, whatever the scale.
+fn ransac_settings(config: &RerankConfig, tolerance_px: f32) -> RansacSettings {
+    RansacSettings {
+        tolerance_px,
+        max_iterations: config.max_iterations,
+        confidence: config.confidence,
+    }
+}
+
+/// The inlier tolerance in pixels. It follows from the size of a base patch at every scale.
 fn tolerance_px(config: &RerankConfig, reference: &PackedPatches) -> f32 {
     config.tolerance_patches * f32::from(reference.grid.patch_px)
 }
 
-/// Scaled to a last entry of 1 where that is possible.
-fn scaled(homography: [f64; 9]) -> [f64; 9] {
+/// The same homography with a last entry of 1, unless that entry is 0.
+fn with_last_entry_one(homography: [f64; 9]) -> [f64; 9] {
     let last = homography[8];
     if last == 0.0 {
         homography

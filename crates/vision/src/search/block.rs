@@ -1,57 +1,23 @@
-//! A few thousand references, column by column: what one thread scans at a time.
+//! A few thousand references, stored column by column: what one thread scans at a time.
 
-use super::IndexEntry;
+use super::entry::IndexEntry;
 use super::filter::{Extent, PlaceAndTime};
+use super::quantised::QuantisedVector;
 use placeformer_core::types::{GLOBAL_DIM, ReferenceId};
 use placeformer_kernels::scan::{Codes, LENGTH, ScanRows};
-use placeformer_kernels::{quantise, simd};
 
 const _: () = assert!(LENGTH == GLOBAL_DIM);
 
-/// References in a full block: a megabyte of codes, some 40 microseconds of scanning.
+/// Number of references in a full block: a megabyte of codes, which takes some 40 microseconds to
+/// scan.
 #[cfg(not(test))]
 pub(super) const CAPACITY: usize = 4096;
-/// Small, so that unit tests pass many borders between blocks; tests of the public interface use
-/// the real one.
+/// Small in unit tests, so that they have many borders between blocks. Tests of the public
+/// interface use the real capacity.
 #[cfg(test)]
 pub(super) const CAPACITY: usize = 64;
 
-/// A vector as int8 codes and what is lost thereby.
-#[derive(Debug, Clone)]
-pub(super) struct Quantised {
-    pub codes: Codes,
-    /// Factor of the codes.
-    pub scale: f32,
-    /// Length of what the codes miss, rounded up.
-    pub error: f32,
-    /// Squared length of the vector itself.
-    pub square: f32,
-}
-
-impl Quantised {
-    /// Quantises symmetrically, the largest magnitude becoming 127.
-    pub(super) fn new(vector: &[f32]) -> Self {
-        let simd = simd::selected();
-        let scale = quantise::largest(simd, vector) / 127.0;
-        // A factor that is zero, subnormal or not finite would make the codes meaningless: all is
-        // error then.
-        let scale = if scale.is_normal() { scale } else { 0.0 };
-        let mut codes = [0; LENGTH];
-        if scale != 0.0 {
-            quantise::quantise(simd, vector, scale, 1.0, &mut codes);
-        }
-        let (missed, square) = quantise::squared_lengths(simd, vector, &codes, scale);
-        let error = missed.sqrt();
-        Self {
-            codes: Codes::new(codes),
-            scale,
-            error: (error * (1.0 + 1e-6)) as f32,
-            square: square as f32,
-        }
-    }
-}
-
-/// References as columns. Sorted by id once sealed.
+/// References as columns of equal length. Sorted by id once the block is sealed.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Block {
     pub ids: Vec<ReferenceId>,
@@ -59,24 +25,31 @@ pub(super) struct Block {
     pub scales: Vec<f32>,
     pub errors: Vec<f32>,
     pub squares: Vec<f32>,
-    /// Full vectors, `[len, 256]` row-major.
+    /// Global descriptors in full precision, `[len, 256]` row-major.
     pub vectors: Vec<f32>,
     pub places: Vec<PlaceAndTime>,
-    /// Holds every place; may be larger than needed after removals.
+    /// Contains every place and time. Removals do not shrink it.
     pub extent: Extent,
-    /// At least the length of the longest quantised vector.
+    /// Upper bound of the lengths of all quantised vectors.
     pub longest: f32,
 }
 
 impl Block {
-    /// Quantises `entries`, in their order.
+    /// A block of `entries`, in their order.
     pub(super) fn of(entries: impl IntoIterator<Item = IndexEntry>) -> Self {
+        let mut block = Self::with_full_capacity();
+        for entry in entries {
+            block.push(&entry, QuantisedVector::new(&entry.global));
+        }
+        block.shrink_to_fit();
+        block
+    }
+
+    /// An empty block with memory for [`CAPACITY`] references, so that rows never move while it
+    /// fills.
+    pub(super) fn with_full_capacity() -> Self {
         let mut block = Self::default();
         block.reserve();
-        entries
-            .into_iter()
-            .for_each(|entry| block.push(&entry, Quantised::new(&entry.global)));
-        block.fit();
         block
     }
 
@@ -84,27 +57,19 @@ impl Block {
         self.ids.len()
     }
 
-    /// What a scan reads.
+    /// The columns that the scan kernels read.
     pub(super) fn rows(&self) -> ScanRows<'_> {
-        let Self {
-            codes,
-            scales,
-            errors,
-            squares,
-            longest,
-            ..
-        } = self;
         ScanRows {
-            codes,
-            scales,
-            errors,
-            squares,
-            longest: *longest,
+            codes: &self.codes,
+            scales: &self.scales,
+            errors: &self.errors,
+            squares: &self.squares,
+            longest: self.longest,
         }
     }
 
-    /// Appends one reference, of which `quantised` is the vector.
-    pub(super) fn push(&mut self, entry: &IndexEntry, quantised: Quantised) {
+    /// Appends one reference; `quantised` is its descriptor.
+    pub(super) fn push(&mut self, entry: &IndexEntry, quantised: QuantisedVector) {
         if self.ids.is_empty() {
             self.reserve();
         }
@@ -117,9 +82,7 @@ impl Block {
         let place = PlaceAndTime::new(entry.location, entry.captured_at);
         self.places.push(place);
         self.extent.add(&place);
-        self.longest = self
-            .longest
-            .max(quantised.square.sqrt() * (1.0 + 1e-6) + quantised.error);
+        self.longest = self.longest.max(quantised.length_bound());
     }
 
     /// Appends a row of another block.
@@ -148,7 +111,7 @@ impl Block {
         self.places.swap_remove(row);
     }
 
-    /// The full vector of a row.
+    /// The descriptor of a row in full precision, `[256]`.
     pub(super) fn vector(&self, row: usize) -> &[f32] {
         &self.vectors[row * LENGTH..(row + 1) * LENGTH]
     }
@@ -160,11 +123,10 @@ impl Block {
         }
         let mut order: Vec<usize> = (0..self.len()).collect();
         order.sort_unstable_by_key(|&row| self.ids[row]);
-        let mut sorted = Self::default();
-        sorted.reserve();
-        order
-            .into_iter()
-            .for_each(|row| sorted.push_row(&self, row));
+        let mut sorted = Self::with_full_capacity();
+        for row in order {
+            sorted.push_row(&self, row);
+        }
         sorted
     }
 
@@ -180,7 +142,6 @@ impl Block {
             + numbers * size_of::<f32>()
     }
 
-    /// Makes room for a full block at once, so that rows never move while it fills.
     fn reserve(&mut self) {
         self.ids.reserve_exact(CAPACITY);
         self.codes.reserve_exact(CAPACITY);
@@ -191,8 +152,8 @@ impl Block {
         self.places.reserve_exact(CAPACITY);
     }
 
-    /// Gives back what a block that is not full does not need.
-    pub(super) fn fit(&mut self) {
+    /// Gives back the memory that a block with fewer rows does not need.
+    pub(super) fn shrink_to_fit(&mut self) {
         self.ids.shrink_to_fit();
         self.codes.shrink_to_fit();
         self.scales.shrink_to_fit();
@@ -200,84 +161,5 @@ impl Block {
         self.squares.shrink_to_fit();
         self.vectors.shrink_to_fit();
         self.places.shrink_to_fit();
-    }
-}
-
-/// A full block that changes no more, and which of its rows still count. Cheap to clone.
-#[derive(Debug, Clone)]
-pub(super) struct Sealed {
-    pub block: std::sync::Arc<Block>,
-    /// One bit per row, set where the row is removed; absent while none is.
-    removed: Option<std::sync::Arc<[u64]>>,
-    /// Rows that still count.
-    pub live: usize,
-    /// The lowest and the highest id. Here rather than read from the block, which would have to be
-    /// fetched for it.
-    pub range: (ReferenceId, ReferenceId),
-}
-
-impl Sealed {
-    /// Seals a block whose rows all count.
-    ///
-    /// # Panics
-    /// If there is no row.
-    pub(super) fn new(block: Block) -> Self {
-        let block = block.sorted();
-        let (live, range) = (block.len(), (block.ids[0], block.ids[block.len() - 1]));
-        Self {
-            block: std::sync::Arc::new(block),
-            removed: None,
-            live,
-            range,
-        }
-    }
-
-    /// Whether a row still counts.
-    pub(super) fn is_live(&self, row: usize) -> bool {
-        self.removed
-            .as_ref()
-            .is_none_or(|bits| bits[row / 64] >> (row % 64) & 1 == 0)
-    }
-
-    /// The row of a reference that still counts.
-    pub(super) fn find(&self, id: ReferenceId) -> Option<usize> {
-        if id < self.range.0 || id > self.range.1 {
-            return None;
-        }
-        self.block
-            .ids
-            .binary_search(&id)
-            .ok()
-            .filter(|&row| self.is_live(row))
-    }
-
-    /// Removes a row that counts. Searches that hold a clone of the block still see it.
-    pub(super) fn remove(&mut self, row: usize) {
-        let mut bits: Vec<u64> = match &self.removed {
-            Some(bits) => bits.to_vec(),
-            None => vec![0; self.block.len().div_ceil(64)],
-        };
-        bits[row / 64] |= 1 << (row % 64);
-        self.removed = Some(bits.into());
-        self.live -= 1;
-    }
-
-    /// One block with the rows of both that still count.
-    pub(super) fn merged(&self, other: &Self) -> Self {
-        let mut merged = Block::default();
-        merged.reserve();
-        for sealed in [self, other] {
-            (0..sealed.block.len())
-                .filter(|&row| sealed.is_live(row))
-                .for_each(|row| merged.push_row(&sealed.block, row));
-        }
-        let mut sealed = merged.sorted();
-        sealed.fit();
-        Self::new(sealed)
-    }
-
-    /// Bytes on the heap.
-    pub(super) fn memory_bytes(&self) -> usize {
-        self.block.memory_bytes() + self.removed.as_ref().map_or(0, |bits| bits.len() * 8)
     }
 }

@@ -1,31 +1,36 @@
-//! An index from references as a store gives them, one after another.
+//! An index from references that a store gives one after another.
 //!
-//! Collecting a map first and building then would hold every vector twice and leave all threads but
-//! the reader's idle. Here references are packed into blocks while the next ones are read: whenever
-//! a block's worth has come, a thread of the rayon pool turns it into one. If the others do not
-//! keep up, the reader lends a hand instead of piling up more.
+//! Collecting a whole map before building its index would hold every vector twice, and leave all
+//! threads idle but the one that reads. Here references are packed into blocks while the next ones
+//! are read: as soon as there are enough for a block, a thread of the rayon pool makes one of them.
+//! If too many wait for a thread, the reading thread packs a block itself, so that memory stays
+//! bounded.
 
-use super::block::{Block, CAPACITY, Sealed};
+use super::block::{Block, CAPACITY};
+use super::entry::IndexEntry;
+use super::index::MapIndex;
 use super::list::BlockList;
-use super::{IndexEntry, MapIndex, check};
+use super::sealed::SealedBlock;
 use placeformer_core::types::ReferenceId;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-/// Block's worths waiting for a thread at most, for each thread.
+/// Most batches of references that wait for a thread, for each thread of the pool.
 const WAITING_PER_THREAD: usize = 2;
 
-/// Takes references and becomes their index; of those with one id the last counts.
+/// Takes references and becomes their index. If several have one id, the last one counts.
 #[derive(Default)]
 pub struct IndexBuilder {
-    filling: Vec<IndexEntry>,
-    /// Those whose id is not above all before, which may replace an earlier one. The store's ids
-    /// ascend, so that they are few.
-    late: Vec<IndexEntry>,
+    /// References for the next block, with ascending ids.
+    batch: Vec<IndexEntry>,
+    /// References whose id is not above all ids before, so that they may replace an earlier one.
+    /// The ids of a store ascend, so there are few of these.
+    out_of_order: Vec<IndexEntry>,
     highest: Option<ReferenceId>,
-    /// Blocks handed to the pool, by their order.
-    handed: usize,
-    sealed: Arc<Mutex<Vec<(usize, Sealed)>>>,
+    /// Number of batches that were handed to the pool.
+    handed_over: usize,
+    /// The blocks that are done, each with its number.
+    done: Arc<Mutex<Vec<(usize, SealedBlock)>>>,
 }
 
 impl IndexBuilder {
@@ -34,65 +39,76 @@ impl IndexBuilder {
     /// # Panics
     /// If the descriptor's length is not 256.
     pub fn push(&mut self, entry: IndexEntry) {
-        check(&entry);
+        entry.assert_length();
         if self.highest.is_some_and(|highest| entry.id <= highest) {
-            self.late.push(entry);
+            self.out_of_order.push(entry);
             return;
         }
         self.highest = Some(entry.id);
-        self.filling.push(entry);
-        if self.filling.len() == CAPACITY {
+        self.batch.push(entry);
+        if self.batch.len() == CAPACITY {
             self.hand_over();
         }
     }
 
-    /// References taken so far, those with the id of an earlier one among them.
+    /// Number of references taken so far; several with one id are counted each.
     pub fn len(&self) -> usize {
-        self.handed * CAPACITY + self.filling.len() + self.late.len()
+        self.handed_over * CAPACITY + self.batch.len() + self.out_of_order.len()
     }
 
-    /// Whether none was taken.
+    /// Whether no reference was taken.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The index of all that was taken.
+    /// The index of all references that were taken.
     pub fn finish(self) -> MapIndex {
-        let len = self.handed * CAPACITY + self.filling.len();
-        let tail = Block::of(self.filling);
-        while lock(&self.sealed).len() < self.handed {
-            // Within the pool, this thread may be the one that has the blocks waiting.
-            if rayon::yield_now() != Some(rayon::Yield::Executed) {
-                std::thread::sleep(Duration::from_micros(100));
-            }
+        let len = self.handed_over * CAPACITY + self.batch.len();
+        let tail = Block::of(self.batch);
+        wait_for(self.handed_over, &self.done);
+        let mut numbered = std::mem::take(&mut *lock(&self.done));
+        numbered.sort_unstable_by_key(|(number, _)| *number);
+        let blocks = numbered.into_iter().map(|(_, block)| block).collect();
+        let index = MapIndex::of(BlockList::new(blocks), tail, self.highest, len);
+        for entry in self.out_of_order {
+            index.insert(entry);
         }
-        let mut sealed = std::mem::take(&mut *lock(&self.sealed));
-        sealed.sort_unstable_by_key(|(number, _)| *number);
-        let blocks = BlockList::new(sealed.into_iter().map(|(_, block)| block).collect());
-        let index = MapIndex::of(blocks, tail, self.highest, len);
-        self.late.into_iter().for_each(|entry| index.insert(entry));
         index
     }
 
+    /// Makes a block of the batch: in another thread, or here if too many are waiting.
     fn hand_over(&mut self) {
-        let (entries, number) = (std::mem::take(&mut self.filling), self.handed);
-        let waiting = self.handed - lock(&self.sealed).len();
-        self.handed += 1;
-        let sealed = Arc::clone(&self.sealed);
+        let entries = std::mem::take(&mut self.batch);
+        let number = self.handed_over;
+        let waiting = self.handed_over - lock(&self.done).len();
+        self.handed_over += 1;
+        let done = Arc::clone(&self.done);
         let pack = move || {
-            let block = Sealed::new(Block::of(entries));
-            lock(&sealed).push((number, block));
+            let block = SealedBlock::new(Block::of(entries));
+            lock(&done).push((number, block));
         };
         if waiting < WAITING_PER_THREAD * rayon::current_num_threads() {
-            rayon::spawn(pack)
+            rayon::spawn(pack);
         } else {
-            pack()
+            pack();
         }
     }
 }
 
-// Pushing to a vector leaves nothing half done that matters.
-fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+/// Waits until `count` blocks are done.
+///
+/// This may be a thread of the pool itself, and the only one that can pack the waiting batches. So
+/// it executes what is waiting, and sleeps only if there is nothing.
+fn wait_for(count: usize, done: &Mutex<Vec<(usize, SealedBlock)>>) {
+    while lock(done).len() < count {
+        if rayon::yield_now() != Some(rayon::Yield::Executed) {
+            std::thread::sleep(Duration::from_micros(100));
+        }
+    }
+}
+
+// A push to a vector is complete or has not happened, so a poisoned lock does not matter.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -115,7 +131,7 @@ mod tests {
         }
     }
 
-    fn same(a: &MapIndex, b: &MapIndex) {
+    fn assert_same(a: &MapIndex, b: &MapIndex) {
         assert_eq!(a.len(), b.len());
         for value in 0..3 {
             let query = entry(0, 1000 + value).global;
@@ -144,13 +160,16 @@ mod tests {
         #![proptest_config(ProptestConfig::with_cases(32))]
         #[test]
         fn whatever_the_order_the_index_is_that_of_building_at_once(
-            ids in prop::collection::vec(0u64..300, 0..40), ascending in 0u64..400, at in 0usize..400,
+            ids in prop::collection::vec(0u64..300, 0..40),
+            ascending in 0u64..400,
+            at in 0usize..400,
         ) {
-            let mut entries: Vec<_> = (0..ascending).map(|number| entry(number * 2, number)).collect();
-            let more = ids.iter().enumerate().map(|(i, &number)| entry(number, 500 + i as u64));
+            let ascending = (0..ascending).map(|number| entry(number * 2, number));
+            let mut entries: Vec<_> = ascending.collect();
+            let more = (500..).zip(&ids).map(|(value, &number)| entry(number, value));
             let at = at.min(entries.len());
             entries.splice(at..at, more);
-            same(&built(&entries), &MapIndex::build(entries));
+            assert_same(&built(&entries), &MapIndex::build(entries));
         }
     }
 
@@ -164,8 +183,8 @@ mod tests {
             .build()
             .unwrap();
         let index = pool.install(|| built(&entries));
-        same(&index, &built(&entries));
-        // What was built goes on changing like any other.
+        assert_same(&index, &built(&entries));
+        // An index that was built this way can be changed like any other.
         index.insert(entry(3, 7));
         assert!(index.remove(entries[4].id) && !index.remove(entries[4].id));
         assert_eq!(index.len(), entries.len() - 1);

@@ -1,23 +1,24 @@
-//! A query's filter, prepared so that most references are decided by a few comparisons.
+//! A query's filter, prepared so that a few comparisons are enough for most references.
 //!
-//! The exact test of a circle costs a dozen trigonometric calls. A circle lies inside a box of
-//! latitudes and longitudes that is known beforehand; whatever is outside the box is outside the
-//! circle, and so is a whole block of references whose own extent misses the box.
+//! The exact test whether a point is inside a circle costs a dozen trigonometric calls. But a
+//! circle lies inside a box of latitudes and longitudes, which is computed once. What is outside
+//! the box is outside the circle; and if the ranges of a whole block of references do not overlap
+//! the box, none of its rows has to be looked at.
 
 use placeformer_core::types::{GeoCircle, GeoPoint, ReferenceFilter};
 use time::OffsetDateTime;
 
-/// Smaller than any radius of the Earth in use, so that boxes come out too large rather than too
-/// small.
+/// Smaller than any radius of the Earth that is in use, so that boxes are never too small.
 const SMALL_EARTH_RADIUS_M: f64 = 6_350_000.0;
 
-/// Degrees added on every side of a box against rounding: about 10 cm.
+/// Degrees by which a box is widened on every side against rounding: about 10 cm.
 const MARGIN_DEGREES: f64 = 1e-6;
 
 /// Where and when one reference was taken, in 32 bytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct PlaceAndTime {
-    // Not a number where there is no location: fails every comparison as it should.
+    /// Degrees; NaN if there is no location. Comparisons with NaN are false, so such a reference is
+    /// outside every box.
     lat: f64,
     lon: f64,
     captured_at: Option<OffsetDateTime>,
@@ -38,7 +39,8 @@ impl PlaceAndTime {
     }
 }
 
-/// The ranges that the references of a block span; empty ranges where none has a value.
+/// The ranges of latitude, longitude and time that the references of a block cover. A range is
+/// empty if no reference has a value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Extent {
     lat: (f64, f64),
@@ -48,19 +50,19 @@ pub(super) struct Extent {
 
 impl Default for Extent {
     fn default() -> Self {
-        let nothing = (f64::INFINITY, f64::NEG_INFINITY);
+        let empty = (f64::INFINITY, f64::NEG_INFINITY);
         Self {
-            lat: nothing,
-            lon: nothing,
+            lat: empty,
+            lon: empty,
             captured_at: None,
         }
     }
 }
 
 impl Extent {
-    /// Grows to hold one more.
+    /// Extends the ranges to contain one more reference.
     pub(super) fn add(&mut self, entry: &PlaceAndTime) {
-        // `min` and `max` ignore what is not a number.
+        // `min` and `max` ignore NaN.
         self.lat = (self.lat.0.min(entry.lat), self.lat.1.max(entry.lat));
         self.lon = (self.lon.0.min(entry.lon), self.lon.1.max(entry.lon));
         if let Some(time) = entry.captured_at {
@@ -70,91 +72,109 @@ impl Extent {
     }
 }
 
-/// The box around a circle.
+/// A box of latitudes and longitudes around a circle, in degrees.
 #[derive(Debug, Clone, Copy)]
-struct Box2 {
+struct BoundingBox {
+    /// South and north.
     lat: (f64, f64),
     centre_lon: f64,
-    /// Half the width; 180 where the circle holds a pole.
+    /// Half the width; 180 if the circle contains a pole.
     half_lon: f64,
 }
 
-impl Box2 {
+impl BoundingBox {
     fn around(circle: &GeoCircle) -> Self {
-        let (lat, centre_lon) = (circle.centre.lat(), circle.centre.lon());
+        let lat = circle.centre.lat();
         let angle = circle.radius_m / SMALL_EARTH_RADIUS_M;
         let half_lat = angle.to_degrees() + MARGIN_DEGREES;
-        let (south, north) = (lat - half_lat, lat + half_lat);
+        let south = lat - half_lat;
+        let north = lat + half_lat;
         let half_lon = if south <= -90.0 || north >= 90.0 {
             180.0
         } else {
-            // The meridian that touches the circle; a circle clear of both poles spans less than a
-            // quarter turn.
-            (angle.sin() / lat.to_radians().cos())
-                .min(1.0)
-                .asin()
-                .to_degrees()
-                + MARGIN_DEGREES
+            // The longitude at which a meridian touches the circle. A circle without a pole covers
+            // less than a quarter turn to each side.
+            let sine = angle.sin() / lat.to_radians().cos();
+            sine.min(1.0).asin().to_degrees() + MARGIN_DEGREES
         };
         Self {
             lat: (south, north),
-            centre_lon,
+            centre_lon: circle.centre.lon(),
             half_lon,
         }
     }
 
     fn contains(&self, lat: f64, lon: f64) -> bool {
-        let apart = (lon - self.centre_lon).abs();
-        lat >= self.lat.0 && lat <= self.lat.1 && apart.min(360.0 - apart) <= self.half_lon
+        let (south, north) = self.lat;
+        let difference = (lon - self.centre_lon).abs();
+        // The shorter way around the Earth.
+        let difference = difference.min(360.0 - difference);
+        lat >= south && lat <= north && difference <= self.half_lon
     }
 
-    fn may_meet(&self, extent: &Extent) -> bool {
-        let (west, east) = (
-            self.centre_lon - self.half_lon,
-            self.centre_lon + self.half_lon,
-        );
+    /// Whether some point within `extent` may be in the box.
+    fn may_overlap(&self, extent: &Extent) -> bool {
+        let (south, north) = self.lat;
+        let overlaps_lat = extent.lat.1 >= south && extent.lat.0 <= north;
+        let west = self.centre_lon - self.half_lon;
+        let east = self.centre_lon + self.half_lon;
         let crosses_date_line = west < -180.0 || east > 180.0;
-        let apart = extent.lon.1 < west || extent.lon.0 > east;
-        extent.lat.1 >= self.lat.0 && extent.lat.0 <= self.lat.1 && (crosses_date_line || !apart)
+        let is_outside_lon = extent.lon.1 < west || extent.lon.0 > east;
+        // A box across the date line has a second part, which is not computed. It is rare, so it
+        // counts as overlapping.
+        overlaps_lat && (crosses_date_line || !is_outside_lon)
     }
 }
 
-/// A prepared filter.
+/// A filter, with the box around its circle.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Sieve {
+pub(super) struct PreparedFilter {
     filter: ReferenceFilter,
-    around: Option<Box2>,
+    bounding_box: Option<BoundingBox>,
 }
 
-impl Sieve {
+impl PreparedFilter {
     pub(super) fn new(filter: &ReferenceFilter) -> Self {
         Self {
             filter: *filter,
-            around: filter.near.as_ref().map(Box2::around),
+            bounding_box: filter.near.as_ref().map(BoundingBox::around),
         }
     }
 
-    /// Whether everything passes.
-    pub(super) fn is_open(&self) -> bool {
+    /// Whether every reference passes.
+    pub(super) fn accepts_all(&self) -> bool {
         self.filter.is_empty()
     }
 
-    /// Whether something within `extent` may pass.
-    pub(super) fn may_pass(&self, extent: &Extent) -> bool {
-        let time = &self.filter;
-        let timed = time.captured_after.is_none() && time.captured_before.is_none()
-            || extent.captured_at.is_some_and(|(first, last)| {
-                time.captured_after.is_none_or(|start| last >= start)
-                    && time.captured_before.is_none_or(|end| first < end)
-            });
-        timed && self.around.is_none_or(|around| around.may_meet(extent))
+    /// Whether some reference within `extent` may pass.
+    pub(super) fn may_accept(&self, extent: &Extent) -> bool {
+        let may_be_near = match &self.bounding_box {
+            Some(bounding_box) => bounding_box.may_overlap(extent),
+            None => true,
+        };
+        may_be_near && self.may_accept_time(extent)
     }
 
-    /// Exactly [`ReferenceFilter::accepts`].
-    pub(super) fn passes(&self, entry: &PlaceAndTime) -> bool {
-        self.around
-            .is_none_or(|around| around.contains(entry.lat, entry.lon))
-            && self.filter.accepts(entry.location(), entry.captured_at)
+    fn may_accept_time(&self, extent: &Extent) -> bool {
+        let after = self.filter.captured_after;
+        let before = self.filter.captured_before;
+        if after.is_none() && before.is_none() {
+            return true;
+        }
+        let Some((first, last)) = extent.captured_at else {
+            return false;
+        };
+        after.is_none_or(|start| last >= start) && before.is_none_or(|end| first < end)
+    }
+
+    /// Whether a reference passes; exactly [`ReferenceFilter::accepts`].
+    pub(super) fn accepts(&self, entry: &PlaceAndTime) -> bool {
+        if let Some(bounding_box) = &self.bounding_box
+            && !bounding_box.contains(entry.lat, entry.lon)
+        {
+            return false;
+        }
+        self.filter.accepts(entry.location(), entry.captured_at)
     }
 }
 
@@ -176,24 +196,30 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(2000))]
         #[test]
-        fn the_sieve_decides_as_the_filter_does(
+        fn the_prepared_filter_decides_as_the_filter_does(
             centre in point(),
             radius in prop_oneof![0.001..10.0, 10.0..1e5, 1e5..3e7],
             // Half of the points lie close to the circle's edge.
             offsets in prop::collection::vec((0.9..1.1f64, 0.0..6.3f64), 1..20),
             others in prop::collection::vec(prop::option::of(point()), 0..20),
             times in prop::collection::vec(prop::option::of(instant()), 40),
-            has_circle in any::<bool>(), after in prop::option::of(instant()), before in prop::option::of(instant()),
+            has_circle in any::<bool>(),
+            after in prop::option::of(instant()),
+            before in prop::option::of(instant()),
         ) {
             let near = has_circle.then(|| GeoCircle::new(centre, radius).unwrap());
-            let filter = ReferenceFilter { near, captured_after: after, captured_before: before };
-            let sieve = Sieve::new(&filter);
+            let filter = ReferenceFilter {
+                near,
+                captured_after: after,
+                captured_before: before,
+            };
+            let prepared = PreparedFilter::new(&filter);
             let edge = offsets.iter().map(|(share, bearing)| {
                 let degrees = share * radius / 111_195.0;
                 let lat = (centre.lat() + degrees * bearing.cos()).clamp(-90.0, 90.0);
                 let stretch = lat.to_radians().cos().max(1e-6);
-                let lon = (centre.lon() + degrees * bearing.sin() / stretch + 180.0).rem_euclid(360.0) - 180.0;
-                GeoPoint::new(lat, lon).ok()
+                let lon = centre.lon() + degrees * bearing.sin() / stretch;
+                GeoPoint::new(lat, (lon + 180.0).rem_euclid(360.0) - 180.0).ok()
             });
             let mut extent = Extent::default();
             let mut any = false;
@@ -202,24 +228,24 @@ mod tests {
                 extent.add(&entry);
                 let expected = filter.accepts(location, time);
                 any |= expected;
-                prop_assert_eq!(sieve.passes(&entry), expected);
+                prop_assert_eq!(prepared.accepts(&entry), expected);
             }
-            prop_assert!(!any || sieve.may_pass(&extent));
+            prop_assert!(!any || prepared.may_accept(&extent));
         }
     }
 
     #[test]
     fn far_blocks_are_skipped() {
         let circle = GeoCircle::new(GeoPoint::new(51.0, 7.0).unwrap(), 500.0).unwrap();
-        let sieve = Sieve::new(&ReferenceFilter {
+        let filter = PreparedFilter::new(&ReferenceFilter {
             near: Some(circle),
             ..ReferenceFilter::default()
         });
         let mut extent = Extent::default();
-        assert!(!sieve.may_pass(&extent));
+        assert!(!filter.may_accept(&extent));
         extent.add(&PlaceAndTime::new(GeoPoint::new(51.0, 7.1).ok(), None));
-        assert!(!sieve.may_pass(&extent));
+        assert!(!filter.may_accept(&extent));
         extent.add(&PlaceAndTime::new(GeoPoint::new(51.0, 6.9).ok(), None));
-        assert!(sieve.may_pass(&extent));
+        assert!(filter.may_accept(&extent));
     }
 }

@@ -1,215 +1,254 @@
-//! The sealed blocks of a map: shared with searches, found by id, merged when they empty.
+//! The sealed blocks of a map: shared with searches, found by id, merged as they become empty.
 //!
-//! A search holds on to what it scans, so whoever changes a block meanwhile must copy the list that
-//! names it. The list is therefore kept in groups, each behind its own pointer: taking a list
-//! copies one pointer for 64 blocks (a quarter of a million references), and a change copies one
-//! group at most. Groups and blocks know the range of their ids, so that looking one up reads
-//! hardly any block but its own; the store's ids ascend, which makes ranges mostly disjoint, but
-//! nothing relies on it.
+//! A search keeps the list of the blocks that it scans. A change during that time must not alter
+//! this list, and so has to copy it. To keep the copy small, the list is divided into groups of 64
+//! blocks, each shared through a pointer of its own: a search copies one pointer for every quarter
+//! of a million references, and a change copies one group at most.
+//!
+//! Groups and blocks know the range of their ids, so that looking up an id reads hardly any block
+//! but the right one. The ids of the store ascend, which makes the ranges mostly disjoint; nothing
+//! depends on that.
 
-use super::block::{Block, CAPACITY, Sealed};
+use super::block::{Block, CAPACITY};
+use super::sealed::SealedBlock;
 use placeformer_core::types::ReferenceId;
 use std::sync::Arc;
 
-/// Blocks in a full group.
+/// Number of blocks in a full group.
 #[cfg(not(test))]
 const GROUP: usize = 64;
-/// Small, so that unit tests pass many borders between groups.
+/// Small in unit tests, so that they have many borders between groups.
 #[cfg(test)]
 const GROUP: usize = 4;
 
-/// Sealed blocks; cheap to clone.
+/// Sealed blocks. Cheap to clone.
 #[derive(Debug, Clone, Default)]
 pub(super) struct BlockList {
     groups: Vec<Arc<Group>>,
 }
 
+/// Some blocks of a list.
 #[derive(Debug, Clone)]
 struct Group {
-    blocks: Vec<Sealed>,
-    /// Holds every id; may be larger than needed after removals.
-    range: (ReferenceId, ReferenceId),
-    /// Blocks that are at most half alive.
+    blocks: Vec<SealedBlock>,
+    /// The lowest and the highest id. Removals do not narrow it.
+    id_range: (ReferenceId, ReferenceId),
+    /// Number of blocks that are sparse; see [`is_sparse`].
     sparse: usize,
 }
 
-/// Where a block is: its group and its place there.
-type Place = (usize, usize);
+/// Where a block is in a list.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct BlockPosition {
+    group: usize,
+    /// Within the group.
+    block: usize,
+}
+
+/// Where a reference is in a list.
+#[derive(Debug, Clone, Copy)]
+struct RowPosition {
+    block: BlockPosition,
+    row: usize,
+}
+
+/// Whether at most half of a block's capacity is in use. Two such blocks fit into one.
+fn is_sparse(sealed: &SealedBlock) -> bool {
+    sealed.live <= CAPACITY / 2
+}
+
+/// The smallest range that contains both.
+fn union(
+    a: (ReferenceId, ReferenceId),
+    b: (ReferenceId, ReferenceId),
+) -> (ReferenceId, ReferenceId) {
+    (a.0.min(b.0), a.1.max(b.1))
+}
 
 impl Group {
-    fn new(blocks: Vec<Sealed>) -> Self {
-        let first = blocks
-            .iter()
-            .map(|block| block.range.0)
-            .min()
-            .unwrap_or(ReferenceId::from_bytes([0; 16]));
-        let last = blocks
-            .iter()
-            .map(|block| block.range.1)
-            .max()
-            .unwrap_or(first);
+    fn new(blocks: Vec<SealedBlock>) -> Self {
+        let ranges = blocks.iter().map(|block| block.id_range);
+        let lowest_id = ReferenceId::from_bytes([0; 16]);
+        let id_range = ranges.reduce(union).unwrap_or((lowest_id, lowest_id));
         let sparse = blocks.iter().filter(|block| is_sparse(block)).count();
         Self {
             blocks,
-            range: (first, last),
+            id_range,
             sparse,
         }
     }
 
+    /// The block and the row of a reference.
     fn find(&self, id: ReferenceId) -> Option<(usize, usize)> {
-        if id < self.range.0 || id > self.range.1 {
+        let (lowest, highest) = self.id_range;
+        if id < lowest || id > highest {
             return None;
         }
-        self.blocks
-            .iter()
-            .enumerate()
-            .find_map(|(block, sealed)| Some((block, sealed.find(id)?)))
+        let mut blocks = self.blocks.iter().enumerate();
+        blocks.find_map(|(block, sealed)| Some((block, sealed.find(id)?)))
     }
-}
 
-fn is_sparse(sealed: &Sealed) -> bool {
-    sealed.live <= CAPACITY / 2
+    fn push(&mut self, sealed: SealedBlock) {
+        self.id_range = union(self.id_range, sealed.id_range);
+        self.sparse += usize::from(is_sparse(&sealed));
+        self.blocks.push(sealed);
+    }
+
+    /// Whether at most half of the group is in use. Two such groups fit into one.
+    fn is_small(&self) -> bool {
+        self.blocks.len() <= GROUP / 2
+    }
+
+    /// Bytes on the heap.
+    fn memory_bytes(&self) -> usize {
+        let blocks: usize = self.blocks.iter().map(SealedBlock::memory_bytes).sum();
+        let list = self.blocks.capacity() * size_of::<SealedBlock>();
+        blocks + list + size_of::<Self>()
+    }
 }
 
 impl BlockList {
     /// A list of `blocks`, none of which is empty.
-    pub(super) fn new(blocks: Vec<Sealed>) -> Self {
+    pub(super) fn new(blocks: Vec<SealedBlock>) -> Self {
         let mut list = Self::default();
         let mut blocks = blocks.into_iter().peekable();
         while blocks.peek().is_some() {
-            list.groups
-                .push(Arc::new(Group::new(blocks.by_ref().take(GROUP).collect())));
+            let group = Group::new(blocks.by_ref().take(GROUP).collect());
+            list.groups.push(Arc::new(group));
         }
         list
     }
 
     /// Appends a block.
-    pub(super) fn push(&mut self, sealed: Sealed) {
+    pub(super) fn push(&mut self, sealed: SealedBlock) {
         match self.groups.last_mut() {
-            Some(last) if last.blocks.len() < GROUP => {
-                let group = Arc::make_mut(last);
-                group.range = (
-                    group.range.0.min(sealed.range.0),
-                    group.range.1.max(sealed.range.1),
-                );
-                group.sparse += usize::from(is_sparse(&sealed));
-                group.blocks.push(sealed);
-            }
+            Some(last) if last.blocks.len() < GROUP => Arc::make_mut(last).push(sealed),
             _ => self.groups.push(Arc::new(Group::new(vec![sealed]))),
         }
     }
 
-    /// Above the number of every block, and the least such.
+    /// The lowest number that is above those of all blocks. Not every number below it is that of a
+    /// block.
     pub(super) fn end(&self) -> usize {
-        self.groups.last().map_or(0, |last| {
-            (self.groups.len() - 1) * GROUP + last.blocks.len()
-        })
+        match self.groups.last() {
+            Some(last) => (self.groups.len() - 1) * GROUP + last.blocks.len(),
+            None => 0,
+        }
     }
 
     /// The block of that number, if there is one.
-    pub(super) fn get(&self, number: usize) -> Option<&Sealed> {
-        self.groups.get(number / GROUP)?.blocks.get(number % GROUP)
+    pub(super) fn get(&self, number: usize) -> Option<&SealedBlock> {
+        let group = self.groups.get(number / GROUP)?;
+        group.blocks.get(number % GROUP)
     }
 
-    /// The block of that number.
+    /// The rows of the block of that number.
     ///
     /// # Panics
-    /// If there is none: the number must be one that [`get`](Self::get) found.
+    /// If there is none: the number must be one for which [`get`](Self::get) gave a block.
     pub(super) fn block(&self, number: usize) -> &Block {
-        &self.groups[number / GROUP].blocks[number % GROUP].block
+        let group = &self.groups[number / GROUP];
+        &group.blocks[number % GROUP].block
     }
 
-    /// The full vector of a reference that counts.
+    /// The descriptor of a reference, `[256]`; `None` if it is not there or removed.
     pub(super) fn vector(&self, id: ReferenceId) -> Option<&[f32]> {
-        let (number, (block, row)) = self.find(id)?;
-        Some(self.groups[number].blocks[block].block.vector(row))
+        let found = self.find(id)?;
+        Some(self.at(found.block).block.vector(found.row))
     }
 
-    /// Removes a reference; false if none of that id counts.
+    /// Removes a reference; false if it is not there.
     pub(super) fn remove(&mut self, id: ReferenceId) -> bool {
-        let Some((number, (block, row))) = self.find(id) else {
+        let Some(found) = self.find(id) else {
             return false;
         };
-        let group = Arc::make_mut(&mut self.groups[number]);
-        let was_sparse = is_sparse(&group.blocks[block]);
-        group.blocks[block].remove(row);
-        group.sparse += usize::from(!was_sparse && is_sparse(&group.blocks[block]));
-        self.compact((number, block));
+        let group = Arc::make_mut(&mut self.groups[found.block.group]);
+        let sealed = &mut group.blocks[found.block.block];
+        let was_sparse = is_sparse(sealed);
+        sealed.remove(found.row);
+        if !was_sparse && is_sparse(sealed) {
+            group.sparse += 1;
+        }
+        self.compact(found.block);
         true
     }
 
     /// Bytes on the heap.
     pub(super) fn memory_bytes(&self) -> usize {
-        let of_group = |group: &Arc<Group>| {
-            let blocks: usize = group.blocks.iter().map(Sealed::memory_bytes).sum();
-            blocks + group.blocks.capacity() * size_of::<Sealed>() + size_of::<Group>()
-        };
-        self.groups.capacity() * size_of::<Arc<Group>>()
-            + self.groups.iter().map(of_group).sum::<usize>()
+        let groups: usize = self.groups.iter().map(|group| group.memory_bytes()).sum();
+        groups + self.groups.capacity() * size_of::<Arc<Group>>()
     }
 
-    fn find(&self, id: ReferenceId) -> Option<(usize, (usize, usize))> {
-        self.groups
-            .iter()
-            .enumerate()
-            .find_map(|(number, group)| Some((number, group.find(id)?)))
+    fn at(&self, position: BlockPosition) -> &SealedBlock {
+        &self.groups[position.group].blocks[position.block]
     }
 
-    /// Drops the block a row was removed from if it is empty, or merges it with another if both are
-    /// at most half alive.
-    fn compact(&mut self, place: Place) {
-        let sealed = &self.groups[place.0].blocks[place.1];
+    fn find(&self, id: ReferenceId) -> Option<RowPosition> {
+        let mut groups = self.groups.iter().enumerate();
+        groups.find_map(|(group, content)| {
+            let (block, row) = content.find(id)?;
+            let block = BlockPosition { group, block };
+            Some(RowPosition { block, row })
+        })
+    }
+
+    /// After a removal from this block: drops it if it is empty, or merges it with another one if
+    /// both are sparse.
+    fn compact(&mut self, position: BlockPosition) {
+        let sealed = self.at(position);
         if sealed.live == 0 {
-            self.take(place);
+            self.take(position);
         } else if is_sparse(sealed)
-            && let Some(other) = self.other_sparse(place)
+            && let Some(other) = self.other_sparse(position)
         {
-            let merged = sealed.merged(&self.groups[other.0].blocks[other.1]);
-            let group = Arc::make_mut(&mut self.groups[place.0]);
-            group.sparse -= usize::from(!is_sparse(&merged));
-            group.range = (
-                group.range.0.min(merged.range.0),
-                group.range.1.max(merged.range.1),
-            );
-            group.blocks[place.1] = merged;
+            let merged = sealed.merged(self.at(other));
+            let group = Arc::make_mut(&mut self.groups[position.group]);
+            if !is_sparse(&merged) {
+                group.sparse -= 1;
+            }
+            group.id_range = union(group.id_range, merged.id_range);
+            group.blocks[position.block] = merged;
             self.take(other);
         }
     }
 
-    /// A block at most half alive, other than the one at `place`.
-    fn other_sparse(&self, place: Place) -> Option<Place> {
-        let within = |(number, group): (usize, &Arc<Group>)| {
-            let here = usize::from(number == place.0);
-            // Of most groups the count says enough.
-            if group.sparse <= here {
-                return None;
+    /// A sparse block other than the one at `position`.
+    fn other_sparse(&self, position: BlockPosition) -> Option<BlockPosition> {
+        for (group, content) in self.groups.iter().enumerate() {
+            let own = usize::from(group == position.group);
+            if content.sparse <= own {
+                // No other block of this group is sparse; there is no need to look at them.
+                continue;
             }
-            let other =
-                |&block: &usize| (number, block) != place && is_sparse(&group.blocks[block]);
-            (0..group.blocks.len())
-                .find(other)
-                .map(|block| (number, block))
-        };
-        self.groups.iter().enumerate().find_map(within)
+            for (block, sealed) in content.blocks.iter().enumerate() {
+                let candidate = BlockPosition { group, block };
+                if candidate != position && is_sparse(sealed) {
+                    return Some(candidate);
+                }
+            }
+        }
+        None
     }
 
-    /// Takes a sparse block out of the list, and merges its group with another if both are at most
-    /// half full.
-    fn take(&mut self, (number, block): Place) {
+    /// Takes a sparse block out of the list, and merges its group with another one if both are
+    /// small.
+    fn take(&mut self, position: BlockPosition) {
+        let number = position.group;
         let group = Arc::make_mut(&mut self.groups[number]);
-        group.blocks.swap_remove(block);
+        group.blocks.swap_remove(position.block);
         group.sparse -= 1;
-        let small = |group: &Group| group.blocks.len() <= GROUP / 2;
         if group.blocks.is_empty() {
             self.groups.swap_remove(number);
-        } else if small(group)
-            && let Some(other) =
-                (0..self.groups.len()).find(|&other| other != number && small(&self.groups[other]))
-        {
-            let both = [number, other]
-                .into_iter()
-                .flat_map(|number| self.groups[number].blocks.iter().cloned());
-            self.groups[number] = Arc::new(Group::new(both.collect()));
+            return;
+        }
+        if !group.is_small() {
+            return;
+        }
+        let mut others = (0..self.groups.len()).filter(|&other| other != number);
+        if let Some(other) = others.find(|&other| self.groups[other].is_small()) {
+            let mut blocks = self.groups[number].blocks.clone();
+            blocks.extend_from_slice(&self.groups[other].blocks);
+            self.groups[number] = Arc::new(Group::new(blocks));
             self.groups.swap_remove(other);
         }
     }
@@ -217,31 +256,28 @@ impl BlockList {
 
 #[cfg(test)]
 mod tests {
-    use super::super::IndexEntry;
     use super::*;
+    use crate::search::entry::IndexEntry;
     use placeformer_core::types::GLOBAL_DIM;
 
     fn id(number: usize) -> ReferenceId {
         ReferenceId::from_bytes((number as u128).to_be_bytes())
     }
 
-    fn sealed(numbers: std::ops::Range<usize>) -> Sealed {
+    fn sealed(numbers: std::ops::Range<usize>) -> SealedBlock {
         let entry = |number| IndexEntry {
             id: id(number),
             global: vec![number as f32; GLOBAL_DIM],
             location: None,
             captured_at: None,
         };
-        Sealed::new(Block::of(numbers.map(entry)))
+        SealedBlock::new(Block::of(numbers.map(entry)))
     }
 
     /// Blocks of consecutive ids.
     fn list(blocks: usize) -> BlockList {
-        BlockList::new(
-            (0..blocks)
-                .map(|block| sealed(block * CAPACITY..(block + 1) * CAPACITY))
-                .collect(),
-        )
+        let blocks = (0..blocks).map(|block| sealed(block * CAPACITY..(block + 1) * CAPACITY));
+        BlockList::new(blocks.collect())
     }
 
     fn check(list: &BlockList, there: impl Fn(usize) -> bool, end: usize) {
@@ -249,26 +285,17 @@ mod tests {
             let found = list.vector(id(number)).map(|vector| vector[0]);
             assert_eq!(found, there(number).then_some(number as f32), "{number}");
         }
-        let blocks: Vec<&Sealed> = (0..list.end())
+        let blocks: Vec<&SealedBlock> = (0..list.end())
             .filter_map(|number| list.get(number))
             .collect();
-        assert_eq!(
-            blocks.iter().map(|block| block.live).sum::<usize>(),
-            (0..end).filter(|&n| there(n)).count()
-        );
-        assert!(blocks.iter().filter(|block| is_sparse(block)).count() <= 1);
+        let live: usize = blocks.iter().map(|block| block.live).sum();
+        assert_eq!(live, (0..end).filter(|&number| there(number)).count());
+        let sparse = blocks.iter().filter(|block| is_sparse(block)).count();
+        assert!(sparse <= 1);
         let counted: usize = list.groups.iter().map(|group| group.sparse).sum();
-        assert_eq!(
-            counted,
-            blocks.iter().filter(|block| is_sparse(block)).count()
-        );
-        assert!(
-            list.groups
-                .iter()
-                .filter(|group| group.blocks.len() <= GROUP / 2)
-                .count()
-                <= 1 + usize::from(end > 0)
-        );
+        assert_eq!(counted, sparse);
+        let small = list.groups.iter().filter(|group| group.is_small()).count();
+        assert!(small <= 1 + usize::from(end > 0));
     }
 
     #[test]
@@ -302,9 +329,7 @@ mod tests {
         assert!(before.vector(id(5)).is_some() && before.vector(id(9_000)).is_none());
         assert!(list.vector(id(5)).is_none() && list.vector(id(9_000)).is_some());
         // The group that did not change is still shared.
-        assert!(
-            Arc::ptr_eq(&before.groups[1], &list.groups[1])
-                && !Arc::ptr_eq(&before.groups[0], &list.groups[0])
-        );
+        assert!(Arc::ptr_eq(&before.groups[1], &list.groups[1]));
+        assert!(!Arc::ptr_eq(&before.groups[0], &list.groups[0]));
     }
 }

@@ -1,18 +1,20 @@
-//! The index against a plain scan of everything.
+//! The index compared with a plain scan of all references.
 
-use super::scan::squared_distance;
-use super::*;
-use placeformer_core::types::GeoCircle;
+use super::block::CAPACITY;
+use super::nearest::squared_distance;
+use super::{IndexEntry, MapIndex, Neighbour};
+use placeformer_core::types::{GLOBAL_DIM, GeoCircle, GeoPoint, ReferenceFilter, ReferenceId};
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
+use time::OffsetDateTime;
 
 fn id(number: u64) -> ReferenceId {
     ReferenceId::from_bytes((u128::from(number) << 32).to_be_bytes())
 }
 
-/// What a made-up vector looks like; each kind is hard for the bounds in its own way.
+/// What an artificial vector looks like; each kind is difficult for the bounds in its own way.
 #[derive(Debug, Clone, Copy)]
 enum Kind {
     Unit,
@@ -215,10 +217,13 @@ enum Operation {
 
 fn operation() -> impl Strategy<Value = Operation> {
     prop_oneof![
-        6 => (0u64..400, 0usize..6, any::<u64>()).prop_map(|(id, kind, seed)| Operation::Insert(id, kind, seed)),
+        6 => (0u64..400, 0usize..6, any::<u64>())
+            .prop_map(|(id, kind, seed)| Operation::Insert(id, kind, seed)),
         2 => (0u64..400).prop_map(Operation::Remove),
-        1 => (0u64..400, 0u64..150).prop_map(|(start, count)| Operation::RemoveRange(start, count)),
-        1 => (0usize..6, any::<u64>(), 0usize..120, 0usize..5).prop_map(|(v, s, k, f)| Operation::Search(v, s, k, f)),
+        1 => (0u64..400, 0u64..150)
+            .prop_map(|(start, count)| Operation::RemoveRange(start, count)),
+        1 => (0usize..6, any::<u64>(), 0usize..120, 0usize..5)
+            .prop_map(|(kind, seed, k, filter)| Operation::Search(kind, seed, k, filter)),
     ]
 }
 
@@ -226,10 +231,12 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
     #[test]
     fn any_history_leaves_the_index_of_what_is_left(
-        initial in 0u64..400, operations in prop::collection::vec(operation(), 0..300),
+        initial in 0u64..400,
+        operations in prop::collection::vec(operation(), 0..300),
     ) {
-        let mut model: BTreeMap<ReferenceId, IndexEntry> =
-            (0..initial).map(|number| (id(number), entry(number, Kind::Unit, number))).collect();
+        let mut model: BTreeMap<ReferenceId, IndexEntry> = (0..initial)
+            .map(|number| (id(number), entry(number, Kind::Unit, number)))
+            .collect();
         let index = MapIndex::build(model.values().cloned().collect());
         for operation in operations {
             match operation {
@@ -239,16 +246,20 @@ proptest! {
                     model.insert(entry.id, entry);
                 }
                 Operation::Remove(number) => {
-                    prop_assert_eq!(index.remove(id(number)), model.remove(&id(number)).is_some());
+                    let was_there = model.remove(&id(number)).is_some();
+                    prop_assert_eq!(index.remove(id(number)), was_there);
                 }
                 Operation::RemoveRange(start, count) => {
                     for number in start..start + count {
-                        prop_assert_eq!(index.remove(id(number)), model.remove(&id(number)).is_some());
+                        let was_there = model.remove(&id(number)).is_some();
+                        prop_assert_eq!(index.remove(id(number)), was_there);
                     }
                 }
                 Operation::Search(kind, seed, k, filter) => {
-                    let (query, filter) = (vector(KINDS[kind], seed), filters()[filter]);
-                    prop_assert_eq!(index.search(&query, k, &filter), brute_force(model.values(), &query, k, &filter));
+                    let query = vector(KINDS[kind], seed);
+                    let filter = filters()[filter];
+                    let expected = brute_force(model.values(), &query, k, &filter);
+                    prop_assert_eq!(index.search(&query, k, &filter), expected);
                 }
             }
             prop_assert_eq!(index.len(), model.len());
@@ -256,15 +267,17 @@ proptest! {
         let query = vector(Kind::Unit, 3);
         let filter = ReferenceFilter::default();
         let rebuilt = MapIndex::build(model.values().cloned().collect());
-        prop_assert_eq!(index.search(&query, 1000, &filter), rebuilt.search(&query, 1000, &filter));
+        let expected = rebuilt.search(&query, 1000, &filter);
+        prop_assert_eq!(index.search(&query, 1000, &filter), expected);
         // At most one sealed block may be more than half empty.
-        let room = (model.len() * 2 + 3 * CAPACITY) * 1400;
-        prop_assert!(index.memory_bytes() < room, "{} bytes for {}", index.memory_bytes(), model.len());
+        let limit = (model.len() * 2 + 3 * CAPACITY) * 1400;
+        let bytes = index.memory_bytes();
+        prop_assert!(bytes < limit, "{bytes} bytes for {}", model.len());
     }
 }
 
 #[test]
-fn searches_beside_changes_see_each_reference_whole() {
+fn searches_during_changes_see_each_reference_whole() {
     let index = MapIndex::build(
         (0..500)
             .map(|number| entry(number, Kind::Unit, number))

@@ -1,11 +1,11 @@
 //! The fused encoder as one operation of candle, for graphs that go on after it.
 //!
-//! An operation sees the storage of its input and gives one fresh tensor, so tokens and attention
-//! share it: `[batch, 1 + n, dim + heads]`, row 0 for the CLS token. The last `heads` columns of a
-//! patch's row are the CLS attention it gets, those of row 0 are zero. There is no gradient:
-//! training runs the encoder of [`train`](placeformer_lab::train).
+//! A custom operation of candle reads the storage of its input and returns one new tensor. Tokens
+//! and attention therefore share a tensor `[batch, 1 + n, dim + heads]`, whose row 0 is the CLS
+//! token. The last `heads` columns of a patch's row hold the CLS attention that the patch gets; in
+//! row 0 they are zero. The operation has no gradient: training has an encoder of its own.
 
-use super::FusedEncoder;
+use super::encoder::FusedEncoder;
 use crate::extract::encoder::{EncodedImage, Encoder};
 use candle_core::{CpuStorage, CustomOp1, Layout, Shape, bail};
 
@@ -25,7 +25,8 @@ impl CustomOp1 for FusedEncoder {
             bail!("{} takes contiguous f32 pixels", CustomOp1::name(self));
         };
         let size = self.spec().input_size;
-        let (height, width) = (size.height as usize, size.width as usize);
+        let height = size.height as usize;
+        let width = size.width as usize;
         let (batch, channels, rows, columns) = layout.shape().dims4()?;
         if (channels, rows, columns) != (3, height, width) {
             bail!(
@@ -34,19 +35,22 @@ impl CustomOp1 for FusedEncoder {
                 layout.shape()
             );
         }
+
         let images: Vec<&[f32]> = values[from..to].chunks_exact(3 * height * width).collect();
         let encoded = self
             .encode_pixels(&images)
             .map_err(candle_core::Error::wrap)?;
-        let (tokens, width) = (1 + self.grid.len(), self.geometry.dim + self.geometry.heads);
-        let mut out = Vec::with_capacity(batch * tokens * width);
-        encoded.iter().for_each(|image| append(image, &mut out));
-        Ok((CpuStorage::F32(out), Shape::from((batch, tokens, width))))
+        let shape = (batch, self.token_count(), self.token_and_attention_width());
+        let mut out = Vec::with_capacity(shape.0 * shape.1 * shape.2);
+        for image in &encoded {
+            append_rows(image, &mut out);
+        }
+        Ok((CpuStorage::F32(out), Shape::from(shape)))
     }
 }
 
-/// The rows of one image.
-fn append(image: &EncodedImage, out: &mut Vec<f32>) {
+/// Appends the rows of one image, `[1 + n, dim + heads]`.
+fn append_rows(image: &EncodedImage, out: &mut Vec<f32>) {
     out.extend_from_slice(&image.cls_token);
     out.extend(std::iter::repeat_n(0.0, image.heads));
     let patches = image.grid.len();

@@ -1,15 +1,19 @@
-//! The weights of a transformer as the fused encoder multiplies by them: packed once, with
+//! The weights of a transformer, packed once as the fused encoder multiplies by them, with
 //! everything that is linear folded in.
 //!
-//! A LayerNorm's scale and shift go into the layer that reads it (W diag(g), b + W s), LayerScale
-//! into the layer it scales (diag(l) W, l b), and the factor log2(e) / sqrt(head_dim) into the
-//! query rows, so that scores are exponents of two. The bias of the keys adds the same to all
-//! scores of a query, which softmax takes out again: it is left out. Keys are that much smaller,
-//! and what bf16 loses of a score is no more than what it loses elsewhere. Inputs that become int8
-//! codes are centred and scaled by channel first ([`super::spread`]); W and b make that good. Sums
-//! are taken in f64 once; what is left at run time is products, biases, and nothing else.
+//! - The scale g and shift s of a LayerNorm go into the layer that reads it: W diag(g), b + W s.
+//! - LayerScale l goes into the layer that it scales: diag(l) W, diag(l) b.
+//! - The query rows get the factor log2(e) / sqrt(head_dim), so that softmax can take powers of two
+//!   of the scores as they are.
+//! - The bias of the keys adds the same number to all scores of a query, and softmax removes it
+//!   again. It is left out, which also keeps the keys small, and so their rounding error.
+//! - Inputs that become int8 codes are centred and scaled by channel first
+//!   ([`super::smoothing`]); W and b undo that.
+//!
+//! The sums for this are taken in f64. At run time only products and biases are left.
 
-use super::spread::{BlockSpread, Spread};
+use super::smoothing::{BlockSmoothing, Smoothing};
+use crate::extract::preset::Geometry;
 use crate::extract::weights::{BlockWeights, Linear, Norm};
 use placeformer_kernels::Simd;
 use placeformer_kernels::gemm::{PackedMatrix, Tiling};
@@ -20,43 +24,74 @@ use std::ops::Range;
 pub(super) struct PackedLinear {
     /// W transposed, `[in, out]`.
     pub weight: PackedMatrix,
-    /// b, zero beyond the last output up to a whole panel.
-    pub bias: Vec<f32>,
-    /// How inputs are scaled before they become codes, `[in]` or empty.
+    /// b, followed by zeros up to a whole panel.
+    bias: Vec<f32>,
+    /// Factor of each input before it becomes a code, `[in]`; empty where inputs are taken as they
+    /// are.
     gain: Vec<f32>,
+    /// Added to each input after that, `[in]` or empty.
     shift: Vec<f32>,
 }
 
+/// For which instructions a layer is packed, and how.
+#[derive(Debug, Clone, Copy)]
+struct Packing {
+    simd: Simd,
+    format: Format,
+    /// Inputs that are multiplied at a time; more than the layer has stands for all.
+    slice: usize,
+}
+
+impl Packing {
+    /// The same for a layer that is multiplied over all its inputs at once.
+    fn whole(simd: Simd, format: Format) -> Self {
+        Self {
+            simd,
+            format,
+            slice: usize::MAX,
+        }
+    }
+}
+
 impl PackedLinear {
-    /// Packs y = W x + b, to be multiplied `slice` inputs at a time, after giving element `(out,
-    /// in)` of W the factor `rows(out) * columns(in)`, b the factor `rows(out)`, and b further what
-    /// `shift` through W comes to.
+    /// Packs y = W x + b as it is, in f32.
+    pub fn plain(simd: Simd, layer: &Linear) -> Self {
+        Self::pack(Packing::whole(simd, Format::F32), layer, |_| 1.0, None)
+    }
+
+    /// Packs `y = diag(output_scale) (W (input_norm(x)) + b)`, where `input_norm` multiplies each
+    /// input by its weight and adds its bias. Without an `input_norm`, x is taken as it is.
     fn pack(
-        (simd, format): (Simd, Format),
+        packing: Packing,
         layer: &Linear,
-        slice: usize,
-        rows: impl Fn(usize) -> f32,
-        columns: Option<&Norm>,
+        output_scale: impl Fn(usize) -> f32,
+        input_norm: Option<&Norm>,
     ) -> Self {
-        let (outputs, inputs) = (layer.bias.len(), layer.weight.len() / layer.bias.len());
-        let scale = |input: usize| columns.map_or(1.0, |norm| norm.weight[input]);
-        let element = |i: usize, o: usize| layer.weight[o * inputs + i] * (rows(o) * scale(i));
-        let weight =
-            PackedMatrix::pack(simd, format, (inputs, outputs), slice.min(inputs), element);
-        let shifted = |o: usize| {
-            let row = &layer.weight[o * inputs..(o + 1) * inputs];
-            let shift = columns.map_or(0.0, |norm| {
-                row.iter()
-                    .zip(&norm.bias)
-                    .map(|(&w, &s)| f64::from(w) * f64::from(s))
-                    .sum::<f64>()
-            });
-            ((f64::from(layer.bias[o]) + shift) * f64::from(rows(o))) as f32
+        let outputs = layer.bias.len();
+        let inputs = layer.weight.len() / outputs;
+
+        let input_scale = |input: usize| input_norm.map_or(1.0, |norm| norm.weight[input]);
+        let element = |input: usize, output: usize| {
+            let scale = output_scale(output) * input_scale(input);
+            layer.weight[output * inputs + input] * scale
         };
-        let padded = outputs.next_multiple_of(Tiling::of(simd).columns);
-        let bias = (0..padded)
-            .map(|o| if o < outputs { shifted(o) } else { 0.0 })
-            .collect();
+        let weight = PackedMatrix::pack(
+            packing.simd,
+            packing.format,
+            (inputs, outputs),
+            packing.slice.min(inputs),
+            element,
+        );
+
+        let bias_of = |output: usize| {
+            let row = &layer.weight[output * inputs..(output + 1) * inputs];
+            let shifted = input_norm.map_or(0.0, |norm| dot(row, &norm.bias));
+            let bias = f64::from(layer.bias[output]) + shifted;
+            (bias * f64::from(output_scale(output))) as f32
+        };
+        let padded = outputs.next_multiple_of(Tiling::of(packing.simd).columns);
+        let mut bias: Vec<f32> = (0..outputs).map(bias_of).collect();
+        bias.resize(padded, 0.0);
         Self {
             weight,
             bias,
@@ -65,31 +100,32 @@ impl PackedLinear {
         }
     }
 
-    /// Packs a layer that multiplies what `spread` makes of its inputs. They come without the scale
-    /// and shift of `norm`, the LayerNorm before it if there is one; these go to the inputs that
-    /// become codes, or else into W and b.
-    fn pack_spread(
-        kernels: (Simd, Format),
+    /// Packs a layer whose inputs become int8 codes if there is a `smoothing` for them.
+    ///
+    /// The inputs arrive without the scale and shift of `norm`, the LayerNorm before the layer (if
+    /// there is one). With smoothing these are applied to the inputs just before they become codes;
+    /// without, they are folded into W and b.
+    fn pack_smoothed(
+        packing: Packing,
         layer: &Linear,
-        slice: usize,
-        rows: impl Fn(usize) -> f32,
-        (norm, spread): (Option<&Norm>, Option<&Spread>),
+        output_scale: impl Fn(usize) -> f32,
+        norm: Option<&Norm>,
+        smoothing: Option<&Smoothing>,
     ) -> Self {
-        let Some(spread) = spread else {
-            return Self::pack(kernels, layer, slice, rows, norm);
+        let Some(smoothing) = smoothing else {
+            return Self::pack(packing, layer, output_scale, norm);
         };
-        let inputs = 0..spread.centre.len();
-        let gain = |i: usize| norm.map_or(1.0, |norm| norm.weight[i]) / spread.scale[i];
-        let shift =
-            |i: usize| (norm.map_or(0.0, |norm| norm.bias[i]) - spread.centre[i]) / spread.scale[i];
-        Self {
-            gain: inputs.clone().map(gain).collect(),
-            shift: inputs.map(shift).collect(),
-            ..Self::pack(kernels, layer, slice, rows, Some(&spread.undone()))
+        let mut packed = Self::pack(packing, layer, output_scale, Some(&smoothing.inverse()));
+        for (input, (centre, scale)) in smoothing.channels().enumerate() {
+            let norm_scale = norm.map_or(1.0, |norm| norm.weight[input]);
+            let norm_shift = norm.map_or(0.0, |norm| norm.bias[input]);
+            packed.gain.push(norm_scale / scale);
+            packed.shift.push((norm_shift - centre) / scale);
         }
+        packed
     }
 
-    /// How the inputs in `range` are scaled before they become codes.
+    /// How the inputs in `range` are scaled and shifted before they become codes.
     pub fn channels(&self, range: Range<usize>) -> ChannelScaling<'_> {
         if self.gain.is_empty() {
             return ChannelScaling::default();
@@ -100,24 +136,24 @@ impl PackedLinear {
         }
     }
 
-    /// Packs a layer as it is, in f32.
-    pub fn plain(simd: Simd, layer: &Linear) -> Self {
-        Self::pack((simd, Format::F32), layer, usize::MAX, |_| 1.0, None)
-    }
-
     /// The biases of one panel.
     pub fn panel_bias(&self, simd: Simd, panel: usize) -> &[f32] {
         let columns = Tiling::of(simd).columns;
         &self.bias[panel * columns..(panel + 1) * columns]
     }
 
+    /// Bytes on the heap.
     pub fn bytes(&self) -> usize {
-        self.weight.bytes()
-            + [&self.bias, &self.gain, &self.shift]
-                .map(|values| size_of_val(values.as_slice()))
-                .iter()
-                .sum::<usize>()
+        let numbers = self.bias.len() + self.gain.len() + self.shift.len();
+        self.weight.bytes() + numbers * size_of::<f32>()
     }
+}
+
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    a.iter()
+        .zip(b)
+        .map(|(&a, &b)| f64::from(a) * f64::from(b))
+        .sum()
 }
 
 /// One transformer block, packed.
@@ -129,53 +165,94 @@ pub(super) struct PackedBlock {
 }
 
 impl PackedBlock {
-    /// Packs a block whose hidden layer is computed `hidden_slice` numbers at a time, and whose
-    /// inputs are scaled by `spread` if they become codes.
+    /// Packs a block whose hidden layer is multiplied `hidden_slice` inputs at a time. `smoothing`
+    /// is there exactly where the inputs of the layers become int8 codes.
     pub fn pack(
-        kernels: (Simd, Format),
+        simd: Simd,
+        format: Format,
         block: &BlockWeights,
-        (dim, head_dim): (usize, usize),
+        geometry: &Geometry,
         hidden_slice: usize,
-        spread: Option<&BlockSpread>,
+        smoothing: Option<&BlockSmoothing>,
     ) -> Self {
-        let query_scale = std::f32::consts::LOG2_E / (head_dim as f32).sqrt();
-        let scale = |layer_scale: &Option<Vec<f32>>, o: usize| {
-            layer_scale.as_ref().map_or(1.0, |scale| scale[o])
+        let whole = Packing::whole(simd, format);
+        let sliced = Packing {
+            slice: hidden_slice,
+            ..whole
         };
-        // Softmax's weights add up to one, so that what is done to all values is done to every mix
-        // of them: the projection's inputs come scaled.
-        let mixed = spread.map(|spread| &spread.proj);
-        let query_or_value = |o: usize| match o {
-            _ if o < dim => query_scale,
-            _ if o < 2 * dim => 1.0,
-            _ => mixed.map_or(1.0, |mixed| 1.0 / mixed.scale[o - 2 * dim]),
-        };
-        let whole = usize::MAX;
-        let norm1 = (Some(&block.norm1), spread.map(|spread| &spread.qkv));
-        let mut qkv = PackedLinear::pack_spread(kernels, &block.qkv, whole, query_or_value, norm1);
-        qkv.bias[dim..2 * dim].fill(0.0);
-        if let Some(Spread { centre, scale }) = mixed {
-            let values = qkv.bias[2 * dim..3 * dim].iter_mut();
-            values
-                .zip(centre.iter().zip(scale))
-                .for_each(|(bias, (centre, scale))| *bias -= centre / scale);
-        }
-        let undone = mixed.map(Spread::undone);
-        let norm2 = (Some(&block.norm2), spread.map(|spread| &spread.fc1));
-        let hidden = (None, spread.map(|spread| &spread.fc2));
-        let (scale1, scale2) = (
-            |o| scale(&block.layer_scale1, o),
-            |o| scale(&block.layer_scale2, o),
-        );
+        let proj_inverse = smoothing.map(|smoothing| smoothing.proj.inverse());
         Self {
-            qkv,
-            proj: PackedLinear::pack(kernels, &block.proj, whole, scale1, undone.as_ref()),
-            fc1: PackedLinear::pack_spread(kernels, &block.fc1, whole, |_| 1.0, norm2),
-            fc2: PackedLinear::pack_spread(kernels, &block.fc2, hidden_slice, scale2, hidden),
+            qkv: pack_qkv(whole, block, geometry, smoothing),
+            proj: PackedLinear::pack(
+                whole,
+                &block.proj,
+                |output| layer_scale(&block.layer_scale1, output),
+                proj_inverse.as_ref(),
+            ),
+            fc1: PackedLinear::pack_smoothed(
+                whole,
+                &block.fc1,
+                |_| 1.0,
+                Some(&block.norm2),
+                smoothing.map(|smoothing| &smoothing.fc1),
+            ),
+            fc2: PackedLinear::pack_smoothed(
+                sliced,
+                &block.fc2,
+                |output| layer_scale(&block.layer_scale2, output),
+                None,
+                smoothing.map(|smoothing| &smoothing.fc2),
+            ),
         }
     }
 
+    /// Bytes on the heap.
     pub fn bytes(&self) -> usize {
         self.qkv.bytes() + self.proj.bytes() + self.fc1.bytes() + self.fc2.bytes()
     }
+}
+
+/// Packs the projections to queries, keys and values.
+///
+/// The inputs of the output projection are smoothed here already: attention takes weighted sums of
+/// the values, and its weights add up to one. So scaling and centring all values scales and centres
+/// every such sum in the same way.
+fn pack_qkv(
+    packing: Packing,
+    block: &BlockWeights,
+    geometry: &Geometry,
+    smoothing: Option<&BlockSmoothing>,
+) -> PackedLinear {
+    let dim = geometry.dim;
+    let query_scale = std::f32::consts::LOG2_E / (geometry.head_dim() as f32).sqrt();
+    let value_smoothing = smoothing.map(|smoothing| &smoothing.proj);
+    let output_scale = |output: usize| {
+        if output < dim {
+            query_scale
+        } else if output < 2 * dim {
+            1.0
+        } else {
+            value_smoothing.map_or(1.0, |values| 1.0 / values.scale[output - 2 * dim])
+        }
+    };
+    let mut qkv = PackedLinear::pack_smoothed(
+        packing,
+        &block.qkv,
+        output_scale,
+        Some(&block.norm1),
+        smoothing.map(|smoothing| &smoothing.qkv),
+    );
+
+    let (key_bias, value_bias) = qkv.bias[dim..3 * dim].split_at_mut(dim);
+    key_bias.fill(0.0);
+    if let Some(values) = value_smoothing {
+        for (bias, (centre, scale)) in value_bias.iter_mut().zip(values.channels()) {
+            *bias -= centre / scale;
+        }
+    }
+    qkv
+}
+
+fn layer_scale(scales: &Option<Vec<f32>>, output: usize) -> f32 {
+    scales.as_ref().map_or(1.0, |scales| scales[output])
 }

@@ -1,7 +1,11 @@
-//! Files of the paper's geometry, whole and spoiled, under both namings.
+//! Files of the paper's geometry, intact and damaged, under both namings.
 
-use super::*;
-use safetensors::tensor::serialize;
+use super::vit_weights::VitWeights;
+use crate::extract::error::ExtractError;
+use crate::extract::preset::Preset;
+use safetensors::tensor::{Dtype, TensorView, serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
 
 type File = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
@@ -9,7 +13,8 @@ const PRESET: Preset = Preset::PlaceformerVits16;
 
 /// A complete file in the fused naming; every tensor holds its own constant.
 fn fused() -> File {
-    let (d, m) = (384, 1536);
+    let d = 384;
+    let m = 1536;
     let mut shapes = vec![
         ("cls_token".to_owned(), vec![1, 1, d]),
         ("pos_embed".to_owned(), vec![1, 197, d]),

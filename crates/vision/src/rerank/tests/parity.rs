@@ -1,6 +1,7 @@
-//! Inliers beside OpenCV's RANSAC on matches of real photographs.
+//! Inliers compared with those of OpenCV's RANSAC, on matches of real photographs.
 
-use super::{estimate, golden};
+use super::estimate;
+use crate::golden;
 
 /// What `benches/peers/verify_opencv.py` writes.
 #[derive(serde::Deserialize)]
@@ -20,10 +21,12 @@ struct Problem {
 
 #[test]
 fn matches_of_photographs_have_on_average_at_least_the_inliers_of_opencv() {
-    let matches: Matches = serde_json::from_slice(&golden("cmu_matches.json")).unwrap();
+    let matches: Matches = serde_json::from_slice(&golden::read("cmu_matches.json")).unwrap();
     assert_eq!(matches.tolerance_px, super::SETTINGS.tolerance_px);
     for same_place in [true, false] {
-        let (mut ours, mut theirs, mut problems) = (0, 0, 0);
+        let mut ours = 0;
+        let mut theirs = 0;
+        let mut problems = 0;
         for problem in matches
             .problems
             .iter()

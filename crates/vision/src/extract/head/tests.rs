@@ -1,0 +1,216 @@
+//! Heads in memory and in files, intact and damaged.
+
+use super::file::{GEM_P, VLAD_WORDS};
+use super::projection::Head;
+use crate::extract::aggregate::Aggregate;
+use crate::extract::error::ExtractError;
+use crate::extract::vlad::VladWords;
+use placeformer_core::types::GLOBAL_DIM;
+use safetensors::tensor::{Dtype, TensorView};
+use std::collections::HashMap;
+use std::path::Path;
+
+fn head() -> Head {
+    let weight = (0..GLOBAL_DIM * 8)
+        .map(|i| ((i * 37) % 101) as f32 / 50.0 - 1.0)
+        .collect();
+    let notes = [("method".to_owned(), "test".to_owned())].into();
+    Head::new(
+        Aggregate::Mean,
+        weight,
+        vec![0.5; GLOBAL_DIM],
+        "backbone-x",
+        notes,
+    )
+    .unwrap()
+}
+
+#[test]
+fn a_head_survives_its_file() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("h.safetensors");
+    head().save(&path).unwrap();
+    let back = Head::load(&path).unwrap();
+    assert_eq!(back, head());
+    assert_eq!(back.content_hash(), head().content_hash());
+    assert_eq!(
+        std::fs::read_dir(dir.path()).unwrap().count(),
+        1,
+        "no unfinished file is left"
+    );
+}
+
+fn vlad(words: usize) -> Aggregate {
+    Aggregate::Vlad(VladWords::new((0..words * 4).map(|i| i as f32 / 9.0).collect(), 4).unwrap())
+}
+
+/// The head of [`head`] behind another pooling.
+fn with_aggregate(aggregate: Aggregate) -> Result<Head, ExtractError> {
+    let head = head();
+    let (weight, bias) = head.weights();
+    let notes = head.notes().clone();
+    Head::new(
+        aggregate,
+        weight.to_vec(),
+        bias.to_vec(),
+        "backbone-x",
+        notes,
+    )
+}
+
+#[test]
+fn the_aggregate_is_part_of_the_file_and_of_the_hash() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("h.safetensors");
+    let mut hashes = std::collections::BTreeSet::new();
+    for aggregate in [
+        Aggregate::Mean,
+        Aggregate::gem(3.0).unwrap(),
+        Aggregate::gem(4.0).unwrap(),
+        vlad(2),
+    ] {
+        let made = with_aggregate(aggregate.clone()).unwrap();
+        made.save(&path).unwrap();
+        let back = Head::load(&path).unwrap();
+        assert_eq!(
+            (&back, back.aggregate(), back.content_hash()),
+            (&made, &aggregate, made.content_hash())
+        );
+        assert_eq!(back.dim(), aggregate.pooled_dim(back.token_dim()));
+        assert!(
+            hashes.insert(back.content_hash()),
+            "{aggregate} shares its hash with another"
+        );
+    }
+    assert!(
+        hashes.contains(&head().content_hash()),
+        "a mean head keeps the hash it always had"
+    );
+    let wrong = with_aggregate(vlad(3)).unwrap_err().to_string();
+    assert!(
+        wrong.contains("takes 8 values, its 3 visual words make 12"),
+        "{wrong}"
+    );
+}
+
+#[test]
+fn a_file_whose_aggregate_does_not_fit_is_refused() {
+    let refusal = |kind: &str, extra: Option<(&str, Vec<usize>)>| {
+        let head = head();
+        let (weight, bias) = head.weights();
+        let values = vec![1.5f32; 64];
+        let view = |shape: Vec<usize>, values: &[f32]| {
+            let bytes = bytemuck::cast_slice::<f32, u8>(&values[..shape.iter().product()]).to_vec();
+            (shape, bytes)
+        };
+        let mut parts = vec![
+            ("weight", view(vec![256, 8], weight)),
+            ("bias", view(vec![256], bias)),
+        ];
+        parts.extend(extra.map(|(name, shape)| (name, view(shape, &values))));
+        let tensors: Vec<_> = parts
+            .iter()
+            .map(|(name, (shape, bytes))| {
+                (
+                    *name,
+                    TensorView::new(Dtype::F32, shape.clone(), bytes).unwrap(),
+                )
+            })
+            .collect();
+        let meta: HashMap<_, _> = [
+            ("backbone".to_owned(), "x".to_owned()),
+            ("aggregate".to_owned(), kind.to_owned()),
+        ]
+        .into();
+        let bytes = safetensors::serialize(tensors, Some(meta)).unwrap();
+        Head::from_bytes(&bytes, Path::new("h"))
+            .err()
+            .map(|error| error.to_string())
+            .unwrap_or_default()
+    };
+    assert_eq!(refusal("gem", Some((GEM_P, vec![1]))), "");
+    assert_eq!(refusal("vlad", Some((VLAD_WORDS, vec![2, 4]))), "");
+    for (kind, extra, part) in [
+        ("median", None, "\"median\" is not one of"),
+        ("mean", Some((GEM_P, vec![1])), "unexpected tensor gem_p"),
+        ("gem", None, "gem_p is missing"),
+        (
+            "gem",
+            Some((GEM_P, vec![2])),
+            "gem_p is F32 [2], not a float [1]",
+        ),
+        ("vlad", Some((VLAD_WORDS, vec![3, 4])), "make 12"),
+        (
+            "vlad",
+            Some((VLAD_WORDS, vec![8])),
+            "not a float [any, any]",
+        ),
+    ] {
+        let refusal = refusal(kind, extra);
+        assert!(refusal.contains(part), "{kind}: {refusal}");
+    }
+}
+
+#[test]
+fn a_damaged_head_is_refused_with_its_fault() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("h.safetensors");
+    head().save(&path).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    let truncated = Head::from_bytes(&bytes[..bytes.len() - 5], &path)
+        .unwrap_err()
+        .to_string();
+    assert!(truncated.contains("truncated"), "{truncated}");
+    let values = [0f32; 12];
+    let view = || TensorView::new(Dtype::F32, vec![3, 4], bytemuck::cast_slice(&values)).unwrap();
+    let meta: HashMap<_, _> = [("backbone".to_owned(), "x".to_owned())].into();
+    let wrong =
+        safetensors::serialize([("weight", view()), ("bias", view())], Some(meta.clone())).unwrap();
+    assert!(
+        Head::from_bytes(&wrong, &path)
+            .unwrap_err()
+            .to_string()
+            .contains("weight is F32 [3, 4]")
+    );
+    let extra = safetensors::serialize([("mu", view())], Some(meta)).unwrap();
+    assert!(
+        Head::from_bytes(&extra, &path)
+            .unwrap_err()
+            .to_string()
+            .contains("unexpected tensor mu")
+    );
+    let unbound = safetensors::serialize([("weight", view())], None).unwrap();
+    assert!(
+        Head::from_bytes(&unbound, &path)
+            .unwrap_err()
+            .to_string()
+            .contains("backbone")
+    );
+}
+
+#[test]
+fn projection_is_affine_then_unit_length() {
+    let global = head().project(&[0.25; 8]);
+    assert_eq!(global.len(), GLOBAL_DIM);
+    assert!((global.iter().map(|v| v * v).sum::<f32>() - 1.0).abs() < 1e-5);
+    let head = head();
+    let (weight, _) = head.weights();
+    let raw: f32 = weight[..8].iter().sum::<f32>() * 0.25 + 0.5;
+    let other: f32 = weight[8..16].iter().sum::<f32>() * 0.25 + 0.5;
+    assert!((global[0] / global[1] - raw / other).abs() < 1e-4);
+}
+
+#[test]
+fn a_stored_vector_of_another_length_is_refused() {
+    let head = head();
+    let pooled = [0.25; 8];
+    assert_eq!(head.project_stored(&pooled).unwrap(), head.project(&pooled));
+    for len in [0, 7, 9] {
+        match head.project_stored(&vec![0.25; len]) {
+            Err(ExtractError::WrongPooledLength { expected, actual }) => {
+                assert_eq!((expected, actual), (8, len));
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+}

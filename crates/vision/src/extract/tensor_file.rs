@@ -1,0 +1,61 @@
+//! Reading safetensors files: what weights and heads have in common.
+
+use super::error::ExtractError;
+use half::{bf16, f16};
+use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+/// A safetensors file in memory: its tensors, and the metadata in its header.
+pub(super) struct TensorFile<'a> {
+    /// Named in errors.
+    pub path: PathBuf,
+    pub tensors: SafeTensors<'a>,
+    pub metadata: HashMap<String, String>,
+}
+
+impl<'a> TensorFile<'a> {
+    /// Parses `bytes`, the content of the file at `path`.
+    ///
+    /// # Errors
+    /// [`ExtractError::BadFile`] if the bytes are not a complete safetensors file.
+    pub fn parse(bytes: &'a [u8], path: &Path) -> Result<Self, ExtractError> {
+        let broken = |error: SafeTensorError| ExtractError::BadFile {
+            path: path.to_owned(),
+            reason: format!("truncated or not a safetensors file: {error}"),
+        };
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(broken)?;
+        let tensors = SafeTensors::deserialize(bytes).map_err(broken)?;
+        Ok(Self {
+            path: path.to_owned(),
+            tensors,
+            metadata: header.metadata().clone().unwrap_or_default(),
+        })
+    }
+
+    /// An error about this file.
+    pub fn bad(&self, reason: impl Into<String>) -> ExtractError {
+        ExtractError::BadFile {
+            path: self.path.clone(),
+            reason: reason.into(),
+        }
+    }
+}
+
+/// The values of a tensor of floats (32 or 16 bits), or `None` for other types.
+pub(super) fn to_f32(view: &TensorView<'_>) -> Option<Vec<f32>> {
+    let bytes = view.data();
+    let from_pairs = |convert: fn([u8; 2]) -> f32| -> Vec<f32> {
+        let (pairs, _) = bytes.as_chunks::<2>();
+        pairs.iter().map(|&pair| convert(pair)).collect()
+    };
+    match view.dtype() {
+        Dtype::F32 => {
+            let (words, _) = bytes.as_chunks::<4>();
+            Some(words.iter().map(|&word| f32::from_le_bytes(word)).collect())
+        }
+        Dtype::F16 => Some(from_pairs(|pair| f16::from_le_bytes(pair).to_f32())),
+        Dtype::BF16 => Some(from_pairs(|pair| bf16::from_le_bytes(pair).to_f32())),
+        _ => None,
+    }
+}

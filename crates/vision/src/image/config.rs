@@ -1,0 +1,46 @@
+//! Limits for the images that are accepted.
+
+use placeformer_core::types::InvalidValue;
+use serde::{Deserialize, Serialize};
+
+/// Limits that are checked before anything is decoded.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ImageConfig {
+    /// Most bytes of an encoded image.
+    pub max_bytes: usize,
+    /// Longest side in pixels.
+    pub max_side: u32,
+    /// Most pixels, width times height.
+    pub max_pixels: u64,
+}
+
+impl Default for ImageConfig {
+    fn default() -> Self {
+        Self {
+            max_bytes: 20 << 20,
+            max_side: 16_384,
+            max_pixels: 64_000_000,
+        }
+    }
+}
+
+impl ImageConfig {
+    /// Checks the settings.
+    ///
+    /// # Errors
+    /// A limit of zero, which no image could meet.
+    pub fn check(&self) -> Result<(), InvalidValue> {
+        let limits = [
+            ("image.max_bytes", self.max_bytes as u64),
+            ("image.max_side", u64::from(self.max_side)),
+            ("image.max_pixels", self.max_pixels),
+        ];
+        for (field, value) in limits {
+            if value == 0 {
+                return Err(InvalidValue::new(field, "0 would refuse every image"));
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,84 @@
+//! Settings of re-ranking.
+
+use placeformer_core::types::{InvalidValue, RerankId, ScaleSet};
+use serde::{Deserialize, Serialize};
+
+/// Settings of re-ranking.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RerankConfig {
+    /// The combinations of scales whose inlier counts add up to S (paper III-E).
+    pub scales: Vec<ScaleSet>,
+    /// Inlier tolerance in multiples of the base patch size.
+    pub tolerance_patches: f32,
+    /// Most homographies that are scored for one combination. Samples of four pairs that no
+    /// homography of a plane can explain are rejected before, and do not count.
+    pub max_iterations: u32,
+    /// The search stops early once a sample without outliers has been drawn with this probability.
+    pub confidence: f64,
+}
+
+/// With more than this, one candidate takes seconds.
+const MOST_ITERATIONS: u32 = 1_000_000;
+
+impl Default for RerankConfig {
+    fn default() -> Self {
+        Self {
+            scales: ScaleSet::paper_default(),
+            tolerance_patches: 1.5,
+            max_iterations: 2000,
+            confidence: 0.995,
+        }
+    }
+}
+
+impl RerankConfig {
+    /// Checks the settings.
+    ///
+    /// # Errors
+    /// A setting under which no candidate could be scored, or only wrongly; the error names it.
+    pub fn check(&self) -> Result<(), InvalidValue> {
+        self.check_scales()?;
+        let tolerance = self.tolerance_patches;
+        if !tolerance.is_finite() || tolerance <= 0.0 {
+            let reason = format!("{tolerance} is not a positive number");
+            return Err(InvalidValue::new("rerank.tolerance_patches", reason));
+        }
+        let iterations = self.max_iterations;
+        if iterations == 0 || iterations > MOST_ITERATIONS {
+            let reason = format!("{iterations} is outside 1 to {MOST_ITERATIONS}");
+            return Err(InvalidValue::new("rerank.max_iterations", reason));
+        }
+        let confidence = self.confidence;
+        let is_probability = confidence > 0.0 && confidence < 1.0;
+        if !is_probability {
+            let reason = format!("{confidence} is not between 0 and 1");
+            return Err(InvalidValue::new("rerank.confidence", reason));
+        }
+        Ok(())
+    }
+
+    fn check_scales(&self) -> Result<(), InvalidValue> {
+        if self.scales.is_empty() {
+            let reason = "no scale combination is given, so every S would be 0";
+            return Err(InvalidValue::new("rerank.scales", reason));
+        }
+        for (i, set) in self.scales.iter().enumerate() {
+            if self.scales[..i].contains(set) {
+                let reason = format!("{set} is given twice");
+                return Err(InvalidValue::new("rerank.scales", reason));
+            }
+        }
+        Ok(())
+    }
+
+    /// Everything that S depends on besides the descriptors: `1,1+2,2+3:t1.5:i2000:c0.995`.
+    pub fn id(&self) -> RerankId {
+        let scales: Vec<String> = self.scales.iter().map(ToString::to_string).collect();
+        let scales = scales.join(",");
+        let tolerance = self.tolerance_patches;
+        let iterations = self.max_iterations;
+        let confidence = self.confidence;
+        RerankId::new(format!("{scales}:t{tolerance}:i{iterations}:c{confidence}"))
+    }
+}

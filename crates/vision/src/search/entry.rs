@@ -1,0 +1,39 @@
+//! What goes into an index, and what comes out.
+
+use placeformer_core::types::{GLOBAL_DIM, GeoPoint, ReferenceId};
+use time::OffsetDateTime;
+
+/// One reference of a map, as the index needs it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct IndexEntry {
+    /// Identity.
+    pub id: ReferenceId,
+    /// Global descriptor, `[256]`.
+    pub global: Vec<f32>,
+    /// Where it was taken, for the geographic filter.
+    pub location: Option<GeoPoint>,
+    /// When it was taken, for the time filter.
+    pub captured_at: Option<OffsetDateTime>,
+}
+
+impl IndexEntry {
+    /// # Panics
+    /// If the descriptor's length is not 256.
+    pub(super) fn assert_length(&self) {
+        assert_eq!(
+            self.global.len(),
+            GLOBAL_DIM,
+            "length of the descriptor of {}",
+            self.id
+        );
+    }
+}
+
+/// A reference that a search found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Neighbour {
+    /// Identity.
+    pub id: ReferenceId,
+    /// Euclidean distance between the global descriptors.
+    pub distance: f32,
+}
