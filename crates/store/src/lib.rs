@@ -20,28 +20,30 @@ use placeformer_core::types::{
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use time::OffsetDateTime;
+use utoipa::ToSchema;
 
 /// Most connections, and most waiting writes: each reader holds files open, each waiting write a
 /// descriptor.
 const MOST_AT_ONCE: usize = 65_536;
 
-/// Settings of the embedded store.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// Settings of the embedded store. The comments of the fields are printed as the manual of the
+/// configuration file.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct StoreConfig {
     /// Most reading connections open at once; further readers wait.
     pub readers: usize,
-    /// Page cache of each connection in KiB. Patches are read through the system's cache, so it
-    /// need not be large.
+    /// Page cache of each connection in KiB. Key patches are read through the system's cache, so
+    /// it need not be large.
     pub cache_kib: u32,
-    /// Size of a database page in bytes, a power of two from 4096 to 65536; fixed when the database
-    /// is created.
+    /// Size of a database page in bytes, a power of two from 4096 to 65536. It is fixed when the
+    /// database is created.
     pub page_bytes: u32,
-    /// Size of the write-ahead log at which it is folded into the database (at most a quarter of
-    /// the reserve).
+    /// Size of the write-ahead log in bytes at which it is folded into the database. Whatever is
+    /// set, it is at most a quarter of the reserve that the disk allows (see reserve_bytes).
     pub log_bytes: u64,
-    /// Room kept free so that deletes succeed on a full disk (at most a quarter of what the disk
-    /// has left).
+    /// Bytes kept free so that deletions succeed on a full disk. Whatever is set, it is at most a
+    /// quarter of what the disk has left.
     pub reserve_bytes: u64,
     /// Writes that may wait for the writer; further ones block their caller.
     pub queue: usize,

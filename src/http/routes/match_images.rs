@@ -4,7 +4,7 @@ use super::shapes::{timed, timings_ms};
 use crate::http::AppState;
 use crate::http::body::read_upload;
 use crate::http::problem::ApiError;
-use crate::pipeline::{MatchSide, Matched};
+use crate::pipeline::{MatchTarget, MatchedPair};
 use axum::extract::{Request, State};
 use axum::response::Response;
 use placeformer_core::types::ReferenceId;
@@ -104,8 +104,8 @@ pub async fn match_images(
     let query = upload.take("query")?;
     let reference_id = std::mem::take(&mut upload.params).checked()?;
     let other = match (upload.take_optional("reference")?, reference_id) {
-        (Some(image), None) => MatchSide::Image(image),
-        (None, Some(id)) => MatchSide::Reference(id),
+        (Some(image), None) => MatchTarget::Image(image),
+        (None, Some(id)) => MatchTarget::Reference(id),
         _ => {
             return Err(ApiError::invalid(
                 "give either the image \"reference\" or reference_id",
@@ -131,7 +131,7 @@ pub async fn match_images(
     Ok(timed(body, &answer.timings))
 }
 
-fn named(pair: &Matched, one: &CombinationMatch) -> (String, CombinationMatchBody) {
+fn named(pair: &MatchedPair, one: &CombinationMatch) -> (String, CombinationMatchBody) {
     let correspondences = one.correspondences.iter().map(|c| {
         let (query, reference) = (c.query as usize, c.reference as usize);
         CorrespondenceBody {

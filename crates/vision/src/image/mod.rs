@@ -24,16 +24,18 @@ pub use resize::{DEVIATION, MEAN};
 
 use placeformer_core::types::{ImageSize, ImageTensor, InvalidValue};
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
-/// Limits checked before decoding.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// Limits checked before decoding. The comments of the fields are printed as the manual of the
+/// configuration file.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ImageConfig {
     /// Largest image in bytes.
     pub max_bytes: usize,
-    /// Longest side in pixels.
+    /// Longest side of an image in pixels.
     pub max_side: u32,
-    /// Most pixels.
+    /// Most pixels, width times height.
     pub max_pixels: u64,
 }
 

@@ -23,20 +23,24 @@ use placeformer_kernels::simd::{self, Simd};
 use rayon::prelude::*;
 use score::{with_prepared, with_workspace};
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
-/// Settings of re-ranking.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// Settings of re-ranking. The comments of the fields are printed as the manual of the
+/// configuration file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct RerankConfig {
-    /// The scale combinations whose inlier counts add up to S.
+    /// The scale combinations whose inlier counts add up to the spatial score S. The best row of
+    /// the paper's table is 1, 1+2, 2+3.
+    #[schema(value_type = Vec<String>)]
     pub scales: Vec<ScaleSet>,
-    /// Inlier tolerance in multiples of the base patch size.
+    /// Inlier tolerance of the homography in multiples of the base patch size.
     pub tolerance_patches: f32,
     /// Most homographies scored for one combination; samples refused as degenerate or twisted do
     /// not count.
     pub max_iterations: u32,
-    /// Probability with which the best homography should have been seen when the search stops
-    /// early.
+    /// The search for a homography stops early once the best one has been seen with this
+    /// probability.
     pub confidence: f64,
 }
 

@@ -1,151 +1,31 @@
 //! Everything the service measures, in Prometheus' terms.
 //!
 //! Every series is registered and set to zero at start, so that an alert on a rate works from the
-//! first minute. Labels are bounded: routes are matched paths, maps beyond the first fifty fold
-//! into `other`.
+//! first minute. Labels are bounded: routes are matched paths, and maps beyond the largest fifty
+//! are added up as `other`.
 
+mod labels;
+
+pub use labels::{MemoryComponent, PipelineStage, Rejection};
+
+use prometheus::core::Collector;
+use prometheus::process_collector::ProcessCollector;
 use prometheus::{
-    Encoder, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge,
+    Encoder, Error, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge,
     IntGaugeVec, Opts, Registry, TextEncoder,
 };
 use std::time::Duration;
-
-/// A stage of the pipeline, as a label and in the timings of an answer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum Stage {
-    /// Bytes to a tensor.
-    Decode,
-    /// Waiting for the compute worker.
-    Queue,
-    /// Tensor to descriptor.
-    Extract,
-    /// Global nearest neighbours.
-    Search,
-    /// Candidates' key patches from the store.
-    Load,
-    /// Matching and verification.
-    Rerank,
-    /// Writing to the store, until it is durable.
-    Commit,
-}
-
-impl Stage {
-    /// All stages in the order of the data.
-    pub const ALL: [Self; 7] = [
-        Self::Decode,
-        Self::Queue,
-        Self::Extract,
-        Self::Search,
-        Self::Load,
-        Self::Rerank,
-        Self::Commit,
-    ];
-
-    /// Its label.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Decode => "decode",
-            Self::Queue => "queue",
-            Self::Extract => "extract",
-            Self::Search => "search",
-            Self::Load => "load",
-            Self::Rerank => "rerank",
-            Self::Commit => "commit",
-        }
-    }
-}
-
-/// Why work was turned away; the values of `rejected_total{reason}`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Rejection {
-    /// The compute queue is full.
-    QueueFull,
-    /// Too many others read or change the store.
-    StoreBusy,
-    /// Too many bytes of bodies are being received.
-    BodyMemory,
-    /// The key's rate is used up.
-    RateLimited,
-    /// Resident memory is above the watermark.
-    MemoryPressure,
-    /// No room to store it.
-    DiskFull,
-    /// Still starting.
-    NotReady,
-    /// Stopping.
-    Draining,
-    /// Its deadline passed.
-    Deadline,
-    /// Its client left.
-    ClientGone,
-}
-
-impl Rejection {
-    /// All reasons.
-    pub const ALL: [Self; 10] = [
-        Self::QueueFull,
-        Self::StoreBusy,
-        Self::BodyMemory,
-        Self::RateLimited,
-        Self::MemoryPressure,
-        Self::DiskFull,
-        Self::NotReady,
-        Self::Draining,
-        Self::Deadline,
-        Self::ClientGone,
-    ];
-
-    /// Its label.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::QueueFull => "queue_full",
-            Self::StoreBusy => "store_busy",
-            Self::BodyMemory => "body_memory",
-            Self::RateLimited => "rate_limited",
-            Self::MemoryPressure => "memory_pressure",
-            Self::DiskFull => "disk_full",
-            Self::NotReady => "not_ready",
-            Self::Draining => "draining",
-            Self::Deadline => "deadline",
-            Self::ClientGone => "client_gone",
-        }
-    }
-}
-
-/// A component whose memory is known.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum MemoryComponent {
-    /// Weights.
-    Model,
-    /// Global descriptors of all maps.
-    Index,
-    /// Key patches kept for the next query.
-    Cache,
-    /// The database engine's own caches.
-    Sqlite,
-}
-
-impl MemoryComponent {
-    const ALL: [Self; 4] = [Self::Model, Self::Index, Self::Cache, Self::Sqlite];
-
-    fn as_str(self) -> &'static str {
-        match self {
-            Self::Model => "model",
-            Self::Index => "index",
-            Self::Cache => "cache",
-            Self::Sqlite => "sqlite",
-        }
-    }
-}
 
 /// Upper bounds in seconds, 1 ms to 10 s.
 const SECONDS: [f64; 16] = [
     0.001, 0.002, 0.004, 0.008, 0.015, 0.025, 0.04, 0.06, 0.1, 0.2, 0.4, 0.8, 1.5, 3.0, 6.0, 10.0,
 ];
-/// Upper bounds of S.
+
+/// Upper bounds of the spatial score S.
 const SCORES: [f64; 14] = [
     0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0, 500.0, 800.0,
 ];
+
 /// Upper bounds in bytes, 1 KiB to 1 MiB.
 const BYTES: [f64; 11] = [
     1024.0,
@@ -160,8 +40,12 @@ const BYTES: [f64; 11] = [
     524_288.0,
     1_048_576.0,
 ];
+
 /// Maps with a series of their own.
 const MAPS_SHOWN: usize = 50;
+
+/// Label of the maps that have no series of their own.
+const OTHER_MAPS: &str = "other";
 
 /// All series. Cheap to share behind an `Arc`; every method is safe from any thread.
 pub struct Metrics {
@@ -184,114 +68,80 @@ pub struct Metrics {
 }
 
 impl Metrics {
-    /// Registers every series. Fails only if two share a name.
-    pub fn new() -> Result<Self, prometheus::Error> {
-        let counter = |name: &str, help: &str, labels: &[&str]| {
-            IntCounterVec::new(Opts::new(full(name), help), labels)
-        };
-        let gauge = |name: &str, help: &str, labels: &[&str]| {
-            IntGaugeVec::new(Opts::new(full(name), help), labels)
-        };
+    /// Registers every series.
+    ///
+    /// # Errors
+    /// Two series share a name.
+    pub fn new() -> Result<Self, Error> {
+        let series = Series(Registry::new());
+        series.add(ProcessCollector::for_self())?;
+        series
+            .gauges("build_info", "Always 1.", &["version"])?
+            .with_label_values(&[env!("CARGO_PKG_VERSION")])
+            .set(1);
         let metrics = Self {
-            registry: Registry::new(),
-            requests: counter(
+            requests: series.counters(
                 "http_requests_total",
                 "Requests answered.",
                 &["route", "method", "status"],
             )?,
-            request_seconds: histogram(
+            request_seconds: series.histograms(
                 "http_request_duration_seconds",
                 "Time to an answer.",
                 &["route"],
                 &SECONDS,
             )?,
-            stage_seconds: histogram(
+            stage_seconds: series.histograms(
                 "stage_duration_seconds",
                 "Time in a stage.",
                 &["stage"],
                 &SECONDS,
             )?,
-            queue_depth: IntGauge::new(full("queue_depth"), "Requests waiting for or in compute.")?,
-            rejected: counter("rejected_total", "Work turned away.", &["reason"])?,
-            references: gauge("references", "References that can be found.", &["map"])?,
-            descriptor_bytes: histogram(
+            queue_depth: series.gauge("queue_depth", "Requests waiting for or in compute.")?,
+            rejected: series.counters("rejected_total", "Work turned away.", &["reason"])?,
+            references: series.gauges("references", "References that can be found.", &["map"])?,
+            descriptor_bytes: series.histograms(
                 "descriptor_bytes",
                 "Size of a stored descriptor.",
                 &["kind"],
                 &BYTES,
             )?,
-            memory_bytes: gauge("memory_bytes", "Memory by component.", &["component"])?,
-            top1_score: Histogram::with_opts(
-                HistogramOpts::new(
-                    full("query_top1_score"),
-                    "S of the best answer after re-ranking.",
-                )
-                .buckets(SCORES.to_vec()),
+            memory_bytes: series.gauges("memory_bytes", "Memory by component.", &["component"])?,
+            top1_score: series.histogram(
+                "query_top1_score",
+                "S of the best answer after re-ranking.",
+                &SCORES,
             )?,
-            unmatched: IntCounter::new(
-                full("query_unmatched_total"),
+            unmatched: series.counter(
+                "query_unmatched_total",
                 "Queries whose best answer is not trusted.",
             )?,
-            corrupt_records: IntCounter::new(
-                full("corrupt_records_total"),
-                "Damaged records met, at start or by any request.",
+            corrupt_records: series.counter(
+                "corrupt_records_total",
+                "Damaged records found, at start or by any request.",
             )?,
-            quarantined: IntGauge::new(
-                full("quarantined_references"),
+            quarantined: series.gauge(
+                "quarantined_references",
                 "Damaged references set aside, not served.",
             )?,
-            ready: IntGauge::new(
-                full("ready"),
+            ready: series.gauge(
+                "ready",
                 "1 if queries are answered (/readyz?for=query), else 0.",
             )?,
-            disk_free_bytes: IntGauge::new(
-                full("disk_free_bytes"),
-                "Free bytes on the store's disk.",
-            )?,
-            cache_lookups: counter(
+            disk_free_bytes: series.gauge("disk_free_bytes", "Free bytes on the store's disk.")?,
+            cache_lookups: series.counters(
                 "patch_cache_lookups_total",
                 "Key patches asked of the cache.",
                 &["result"],
             )?,
+            registry: series.0,
         };
-        metrics.register()?;
         metrics.start_at_zero();
         Ok(metrics)
     }
 
-    fn register(&self) -> Result<(), prometheus::Error> {
-        let build = IntGaugeVec::new(Opts::new(full("build_info"), "Always 1."), &["version"])?;
-        build.with_label_values(&[env!("CARGO_PKG_VERSION")]).set(1);
-        self.registry.register(Box::new(build))?;
-        self.registry.register(Box::new(self.requests.clone()))?;
-        self.registry
-            .register(Box::new(self.request_seconds.clone()))?;
-        self.registry
-            .register(Box::new(self.stage_seconds.clone()))?;
-        self.registry.register(Box::new(self.queue_depth.clone()))?;
-        self.registry.register(Box::new(self.rejected.clone()))?;
-        self.registry.register(Box::new(self.references.clone()))?;
-        self.registry
-            .register(Box::new(self.descriptor_bytes.clone()))?;
-        self.registry
-            .register(Box::new(self.memory_bytes.clone()))?;
-        self.registry.register(Box::new(self.top1_score.clone()))?;
-        self.registry.register(Box::new(self.unmatched.clone()))?;
-        self.registry
-            .register(Box::new(self.corrupt_records.clone()))?;
-        self.registry.register(Box::new(self.quarantined.clone()))?;
-        self.registry.register(Box::new(self.ready.clone()))?;
-        self.registry
-            .register(Box::new(self.disk_free_bytes.clone()))?;
-        self.registry
-            .register(Box::new(self.cache_lookups.clone()))?;
-        self.registry.register(Box::new(
-            prometheus::process_collector::ProcessCollector::for_self(),
-        ))
-    }
-
     fn start_at_zero(&self) {
-        for stage in Stage::ALL {
+        for stage in PipelineStage::ALL {
             self.stage_seconds.with_label_values(&[stage.as_str()]);
         }
         for reason in Rejection::ALL {
@@ -306,7 +156,7 @@ impl Metrics {
         for result in ["hit", "miss"] {
             self.cache_lookups.with_label_values(&[result]);
         }
-        self.references.with_label_values(&["other"]);
+        self.references.with_label_values(&[OTHER_MAPS]);
     }
 
     /// Makes the series of a route appear with zeros, one for each status it documents.
@@ -329,7 +179,7 @@ impl Metrics {
     }
 
     /// A stage took this long.
-    pub fn stage(&self, stage: Stage, took: Duration) {
+    pub fn stage(&self, stage: PipelineStage, took: Duration) {
         self.stage_seconds
             .with_label_values(&[stage.as_str()])
             .observe(took.as_secs_f64());
@@ -345,7 +195,7 @@ impl Metrics {
         self.queue_depth.inc();
     }
 
-    /// It left them.
+    /// A request left them.
     pub fn queue_left(&self) {
         self.queue_depth.dec();
     }
@@ -360,8 +210,9 @@ impl Metrics {
             .observe(patches as f64);
     }
 
-    /// A query's best S (0 without any answer, `None` if it was not re-ranked), and whether that
-    /// answer is trusted (`None` if nobody can say).
+    /// A query was answered. `top1_score` is the S of its best result: 0 without any result, `None`
+    /// if it was not re-ranked. `matched` says whether that result is trusted: `None` without a
+    /// calibration.
     pub fn query_answered(&self, top1_score: Option<u32>, matched: Option<bool>) {
         if let Some(score) = top1_score {
             self.top1_score.observe(f64::from(score));
@@ -371,7 +222,7 @@ impl Metrics {
         }
     }
 
-    /// So many damaged records were met for the first time.
+    /// So many damaged records were found that had not been found before.
     pub fn corrupt_records(&self, records: u64) {
         self.corrupt_records.inc_by(records);
     }
@@ -392,7 +243,7 @@ impl Metrics {
             .set(i64::try_from(bytes).unwrap_or(i64::MAX));
     }
 
-    /// The patch cache was asked.
+    /// The patch cache was asked for the key patches of a reference.
     pub fn cache_lookup(&self, hit: bool) {
         self.cache_lookups
             .with_label_values(&[if hit { "hit" } else { "miss" }])
@@ -415,13 +266,17 @@ impl Metrics {
             self.references.with_label_values(&[map]).set(*count as i64);
         }
         let other: u64 = rest.iter().map(|(_, count)| count).sum();
+        // Added, because a map may have that name, too.
         self.references
-            .with_label_values(&["other"])
+            .with_label_values(&[OTHER_MAPS])
             .add(other as i64);
     }
 
-    /// The exposition text.
-    pub fn render(&self) -> Result<String, prometheus::Error> {
+    /// All series in Prometheus' text format.
+    ///
+    /// # Errors
+    /// A series cannot be written as text.
+    pub fn render(&self) -> Result<String, Error> {
         TextEncoder::new().encode_to_string(&self.registry.gather())
     }
 
@@ -431,20 +286,61 @@ impl Metrics {
     }
 }
 
-fn full(name: &str) -> String {
-    format!("placeformer_{name}")
+/// Makes series and registers them. Names are given without the prefix of the service.
+struct Series(Registry);
+
+impl Series {
+    fn add<C: Collector + 'static>(&self, collector: C) -> Result<(), Error> {
+        self.0.register(Box::new(collector))
+    }
+
+    fn counter(&self, name: &str, help: &str) -> Result<IntCounter, Error> {
+        let counter = IntCounter::with_opts(options(name, help))?;
+        self.add(counter.clone())?;
+        Ok(counter)
+    }
+
+    fn counters(&self, name: &str, help: &str, labels: &[&str]) -> Result<IntCounterVec, Error> {
+        let counters = IntCounterVec::new(options(name, help), labels)?;
+        self.add(counters.clone())?;
+        Ok(counters)
+    }
+
+    fn gauge(&self, name: &str, help: &str) -> Result<IntGauge, Error> {
+        let gauge = IntGauge::with_opts(options(name, help))?;
+        self.add(gauge.clone())?;
+        Ok(gauge)
+    }
+
+    fn gauges(&self, name: &str, help: &str, labels: &[&str]) -> Result<IntGaugeVec, Error> {
+        let gauges = IntGaugeVec::new(options(name, help), labels)?;
+        self.add(gauges.clone())?;
+        Ok(gauges)
+    }
+
+    fn histogram(&self, name: &str, help: &str, bounds: &[f64]) -> Result<Histogram, Error> {
+        let options = HistogramOpts::from(options(name, help)).buckets(bounds.to_vec());
+        let histogram = Histogram::with_opts(options)?;
+        self.add(histogram.clone())?;
+        Ok(histogram)
+    }
+
+    fn histograms(
+        &self,
+        name: &str,
+        help: &str,
+        labels: &[&str],
+        bounds: &[f64],
+    ) -> Result<HistogramVec, Error> {
+        let options = HistogramOpts::from(options(name, help)).buckets(bounds.to_vec());
+        let histograms = HistogramVec::new(options, labels)?;
+        self.add(histograms.clone())?;
+        Ok(histograms)
+    }
 }
 
-fn histogram(
-    name: &str,
-    help: &str,
-    labels: &[&str],
-    bounds: &[f64],
-) -> Result<HistogramVec, prometheus::Error> {
-    HistogramVec::new(
-        HistogramOpts::new(full(name), help).buckets(bounds.to_vec()),
-        labels,
-    )
+fn options(name: &str, help: &str) -> Opts {
+    Opts::new(format!("placeformer_{name}"), help)
 }
 
 #[cfg(test)]
