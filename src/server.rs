@@ -1,8 +1,8 @@
 //! The running server: from settings to a model, a store, a pipeline, and the web surface over it.
 //!
-//! The listener is bound before anything slow begins, so that `/livez` and `/readyz` answer from the
-//! start. The model and the store are opened on a blocking thread; requests are served once both
-//! are open.
+//! The listener is bound before anything slow begins, so that `/livez` and `/readyz` answer from
+//! the start. The model and the store are opened on a blocking thread; requests are served once
+//! both are open.
 
 use crate::config::Config;
 use crate::http::{AppState, serve};
@@ -20,6 +20,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio::task::spawn_blocking;
+use tokio_util::task::AbortOnDropHandle;
 
 /// Time between two checks of the disk's free space.
 const DISK_CHECK_INTERVAL: Duration = Duration::from_secs(2);
@@ -187,11 +188,13 @@ pub async fn run_server(
         metrics.clone(),
         health.clone(),
     )?;
-    let disk_watch = tokio::spawn(watch_disk(config.clone(), health, metrics));
+    let watching = tokio::spawn(watch_disk(config.clone(), health, metrics));
+    let _watching = AbortOnDropHandle::new(watching);
     let opening = open(state.clone(), config, loaders);
     let serving = serve(listener, state, shutdown);
     tokio::pin!(serving);
-    let outcome = tokio::select! {
+    // A shutdown during start-up ends the server without waiting for the model and the store.
+    tokio::select! {
         biased;
         () = &mut serving => Ok(()),
         opened = opening => match opened {
@@ -201,9 +204,7 @@ pub async fn run_server(
             }
             Err(error) => Err(error),
         },
-    };
-    disk_watch.abort();
-    outcome
+    }
 }
 
 /// Opens the model and the store, starts the pipeline on them, and lets requests in.

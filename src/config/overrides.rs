@@ -53,7 +53,10 @@ impl Overrides {
             "log.format" => (self.log_format.is_some(), "--log-format"),
             "log.filter" => (self.log.is_some(), "--log"),
             "extract.preset" => (self.model.preset.is_some(), "--preset"),
-            "extract.weights" => (self.model.weights.is_some(), "--weights"),
+            "extract.weights" => (
+                self.model.weights.is_some(),
+                "--weights or PLACEFORMER_WEIGHTS",
+            ),
             "extract.head" => (self.model.head.is_some(), "--head"),
             "extract.precision" => (self.model.precision.is_some(), "--precision"),
             _ => return None,

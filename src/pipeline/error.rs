@@ -51,7 +51,8 @@ pub enum PipelineError {
     },
     /// The calibration was fitted on scores of another re-ranking than this server's.
     #[error(
-        "the calibration for map {map} was fitted for re-ranking \"{given}\", this server's is \"{server}\""
+        "the calibration for map {map} was fitted for re-ranking \"{given}\", this server's is \
+         \"{server}\""
     )]
     RerankMismatch {
         /// The map.

@@ -259,8 +259,8 @@ pub(super) fn index_entry(row: GlobalRow) -> IndexEntry {
     }
 }
 
-// A panic while one of these locks is locked for writing leaves its value whole, because each of them
-// is changed by one assignment or one call, so a poisoned lock can be used all the same.
+// A thread that panics with one of these locks leaves the value whole, because each value is
+// changed by one assignment or one call. So a poisoned lock can be used all the same.
 
 fn lock<T>(lock: &Mutex<T>) -> MutexGuard<'_, T> {
     lock.lock().unwrap_or_else(PoisonError::into_inner)

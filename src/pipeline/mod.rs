@@ -18,7 +18,8 @@
 //! | `service`, `startup` | the state they share, and how it is built from the store |
 //! | `extraction` | decoding and the compute worker |
 //! | `admission`, `blocking` | bounds on waiting and on threads |
-//! | `maps`, `patches`, `calibrations` | index and locks of each map; cache of key patches; confidence |
+//! | `maps`, `patches` | index and locks of each map; cache of key patches |
+//! | `calibrations` | how far the best answer can be trusted |
 
 mod admission;
 mod blocking;

@@ -24,10 +24,10 @@ pub struct ExtractConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>)]
     pub weights: Option<PathBuf>,
-    /// Size in pixels, such as 448x336, that images are squashed to. Each side is a multiple of the
-    /// patch size. Unless set, it is the preset's own.
+    /// Size in pixels that images are squashed to, such as { width = 448, height = 336 }. Each side
+    /// is a multiple of the patch size. Unless set, it is the preset's own.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(value_type = Option<String>)]
+    #[schema(value_type = Option<Object>)]
     pub input_size: Option<ImageSize>,
     /// 0-based block of the transformer whose tokens are used; later blocks are not computed.
     /// Unless set, it is the preset's own.
