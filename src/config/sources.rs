@@ -118,7 +118,7 @@ impl<'a> Sources<'a> {
     /// A source cannot be parsed, or a key is unknown or has the wrong type.
     pub(super) fn extract<T: DeserializeOwned>(&self) -> Result<T, ConfigError> {
         let values = self.merged.extract();
-        values.map_err(|error| ConfigError::Invalid(Box::new(self.with_source(error))))
+        values.map_err(|error| ConfigError::Invalid(Box::new(error)))
     }
 
     /// What set `keys`; those that nobody set are left out.
@@ -162,19 +162,6 @@ impl<'a> Sources<'a> {
         settings
             .filter_map(|setting| self.origin(&format!("{name}.{}", setting.name)))
             .collect()
-    }
-
-    /// Corrects the source of an error about an unknown key. `figment` names the source of the
-    /// section around the key, which may be the defaults, and none for a key without a section.
-    fn with_source(&self, mut error: figment::Error) -> figment::Error {
-        if let figment::error::Kind::UnknownField(field, _) = &error.kind {
-            let mut levels = error.path.clone();
-            levels.push(field.clone());
-            if let Some(metadata) = self.merged.find_metadata(&levels.join(".")) {
-                error.metadata = Some(metadata.clone());
-            }
-        }
-        error
     }
 }
 

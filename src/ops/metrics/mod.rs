@@ -50,16 +50,14 @@ const OTHER_MAPS: &str = "other";
 /// All series. Cheap to share behind an `Arc`; every method is safe from any thread.
 pub struct Metrics {
     registry: Registry,
-    requests: IntCounterVec,
-    request_seconds: HistogramVec,
+    requests: RequestSeries,
     stage_seconds: HistogramVec,
     queue_depth: IntGauge,
     rejected: IntCounterVec,
     references: IntGaugeVec,
     descriptor_bytes: HistogramVec,
     memory_bytes: IntGaugeVec,
-    top1_score: Histogram,
-    unmatched: IntCounter,
+    queries: QuerySeries,
     corrupt_records: IntCounter,
     quarantined: IntGauge,
     ready: IntGauge,
@@ -80,17 +78,7 @@ impl Metrics {
             .with_label_values(&[env!("CARGO_PKG_VERSION")])
             .set(1);
         let metrics = Self {
-            requests: series.counters(
-                "http_requests_total",
-                "Requests answered.",
-                &["route", "method", "status"],
-            )?,
-            request_seconds: series.histograms(
-                "http_request_duration_seconds",
-                "Time to an answer.",
-                &["route"],
-                &SECONDS,
-            )?,
+            requests: RequestSeries::new(&series)?,
             stage_seconds: series.histograms(
                 "stage_duration_seconds",
                 "Time in a stage.",
@@ -107,15 +95,7 @@ impl Metrics {
                 &BYTES,
             )?,
             memory_bytes: series.gauges("memory_bytes", "Memory by component.", &["component"])?,
-            top1_score: series.histogram(
-                "query_top1_score",
-                "S of the best answer after re-ranking.",
-                &SCORES,
-            )?,
-            unmatched: series.counter(
-                "query_unmatched_total",
-                "Queries whose best answer is not trusted.",
-            )?,
+            queries: QuerySeries::new(&series)?,
             corrupt_records: series.counter(
                 "corrupt_records_total",
                 "Damaged records found, at start or by any request.",
@@ -161,9 +141,10 @@ impl Metrics {
 
     /// Makes the series of a route appear with zeros, one for each status it documents.
     pub fn expect_route(&self, route: &str, method: &str, statuses: impl IntoIterator<Item = u16>) {
-        self.request_seconds.with_label_values(&[route]);
+        self.requests.seconds.with_label_values(&[route]);
         for status in statuses {
             self.requests
+                .answered
                 .with_label_values(&[route, method, &status.to_string()]);
         }
     }
@@ -171,9 +152,11 @@ impl Metrics {
     /// One request was answered.
     pub fn request(&self, route: &str, method: &str, status: u16, took: Duration) {
         self.requests
+            .answered
             .with_label_values(&[route, method, &status.to_string()])
             .inc();
-        self.request_seconds
+        self.requests
+            .seconds
             .with_label_values(&[route])
             .observe(took.as_secs_f64());
     }
@@ -215,10 +198,10 @@ impl Metrics {
     /// calibration.
     pub fn query_answered(&self, top1_score: Option<u32>, matched: Option<bool>) {
         if let Some(score) = top1_score {
-            self.top1_score.observe(f64::from(score));
+            self.queries.top1_score.observe(f64::from(score));
         }
         if matched == Some(false) {
-            self.unmatched.inc();
+            self.queries.unmatched.inc();
         }
     }
 
@@ -283,6 +266,52 @@ impl Metrics {
     /// Content type of [`Metrics::render`].
     pub fn content_type() -> String {
         TextEncoder::new().format_type().to_owned()
+    }
+}
+
+/// What became of HTTP requests.
+struct RequestSeries {
+    answered: IntCounterVec,
+    seconds: HistogramVec,
+}
+
+impl RequestSeries {
+    fn new(series: &Series) -> Result<Self, Error> {
+        Ok(Self {
+            answered: series.counters(
+                "http_requests_total",
+                "Requests answered.",
+                &["route", "method", "status"],
+            )?,
+            seconds: series.histograms(
+                "http_request_duration_seconds",
+                "Time to an answer.",
+                &["route"],
+                &SECONDS,
+            )?,
+        })
+    }
+}
+
+/// How good the answers of queries are.
+struct QuerySeries {
+    top1_score: Histogram,
+    unmatched: IntCounter,
+}
+
+impl QuerySeries {
+    fn new(series: &Series) -> Result<Self, Error> {
+        Ok(Self {
+            top1_score: series.histogram(
+                "query_top1_score",
+                "S of the best answer after re-ranking.",
+                &SCORES,
+            )?,
+            unmatched: series.counter(
+                "query_unmatched_total",
+                "Queries whose best answer is not trusted.",
+            )?,
+        })
     }
 }
 
