@@ -192,13 +192,13 @@ impl Service {
         let neighbours = self.search(plan, query, &mut timings);
         let reranking = self.rerank(plan, query, &neighbours, &mut timings)?;
         let reranked = reranking.is_some();
-        let by_distance = || {
-            neighbours
+        let ranking = match reranking {
+            Some(ranking) => ranking,
+            None => neighbours
                 .iter()
                 .map(RankedNeighbour::by_distance)
-                .collect()
+                .collect(),
         };
-        let ranking = reranking.unwrap_or_else(by_distance);
 
         let results = self.with_metadata(plan, ranking)?;
         let confidence = self.confidence(plan, results.first(), reranked);
