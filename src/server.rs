@@ -1,8 +1,8 @@
-//! The running server: settings to a model, a store, a pipeline, and a surface that serves them.
+//! The running server: from settings to a model, a store, a pipeline, and the web surface over it.
 //!
-//! The listener is bound before anything slow begins, so that `/livez` and `/readyz` answer from the
-//! first moment. The model and the store load on a thread of their own; requests are served once
-//! both are there.
+//! The listener is bound before anything slow begins, so that `/livez` and `/readyz` answer from
+//! the start. The model and the store are opened on a blocking thread; requests are served once
+//! both are open.
 
 use crate::config::Config;
 use crate::http::{AppState, serve};
@@ -20,20 +20,21 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio::task::spawn_blocking;
+use tokio_util::task::AbortOnDropHandle;
 
-/// Time between two looks at the disk.
-const DISK_CHECK: Duration = Duration::from_secs(2);
+/// Time between two checks of the disk's free space.
+const DISK_CHECK_INTERVAL: Duration = Duration::from_secs(2);
 
 /// How long blocking work may go on after the last request was answered.
 const BLOCKING_GRACE: Duration = Duration::from_secs(5);
 
-/// What a loader said when it failed.
+/// The error of a loader.
 pub type LoadError = Box<dyn Error + Send + Sync>;
 
-/// Makes one of the parts that take long to open; runs on a blocking thread.
+/// Opens one of the parts that take long; runs on a blocking thread.
 pub type Loader<T> = Box<dyn FnOnce() -> Result<Arc<T>, LoadError> + Send>;
 
-/// The parts a server opens with.
+/// How a server opens its model and its store. Tests put their own in the place of these.
 pub struct Loaders {
     /// Loads the model.
     pub source: Loader<dyn DescriptorSource>,
@@ -48,18 +49,18 @@ pub enum ServerError {
     /// The runtime of the asynchronous tasks cannot be made.
     #[error("the runtime cannot start")]
     Runtime(#[source] std::io::Error),
-    /// The address cannot be listened on.
+    /// The server cannot listen on its address.
     #[error("cannot listen on {address}")]
     Listen {
-        /// As the settings give it.
+        /// The address in the settings.
         address: String,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A metric cannot be registered.
     #[error("the metrics cannot be registered")]
     Metrics(#[from] prometheus::Error),
-    /// A setting of the surface is not valid.
+    /// A setting of the web surface is not valid.
     #[error(transparent)]
     Setting(#[from] InvalidValue),
     /// The model cannot be loaded.
@@ -68,10 +69,10 @@ pub enum ServerError {
     /// The store cannot be opened.
     #[error(transparent)]
     Store(LoadError),
-    /// The pipeline does not start upon them.
+    /// The pipeline cannot start on the model and the store.
     #[error(transparent)]
     Pipeline(#[from] PipelineError),
-    /// The thread that opens the parts ended before it was done.
+    /// The thread that opens the model and the store panicked, or the runtime shut down.
     #[error("start-up failed: {0}")]
     Interrupted(String),
 }
@@ -82,11 +83,11 @@ pub enum ServerError {
 pub struct OpenStoreError {
     /// The directory.
     pub directory: PathBuf,
-    /// What the store said.
+    /// The store's error.
     pub source: StoreError,
 }
 
-/// The parts that `config` names.
+/// Loaders of the model and the store that `config` names.
 pub fn loaders(config: &Config) -> Loaders {
     let extract = config.extract.clone();
     let directory = config.data.directory.clone();
@@ -97,7 +98,8 @@ pub fn loaders(config: &Config) -> Loaders {
     }
 }
 
-/// Loads the model and has it describe one image, so that the first request is as fast as the next.
+/// Loads the model and lets it describe one image, so that the first request is as fast as later
+/// ones.
 ///
 /// # Errors
 /// The weights cannot be obtained, or weights, head and settings do not fit.
@@ -110,7 +112,7 @@ pub fn open_model(config: &ExtractConfig) -> Result<Arc<dyn DescriptorSource>, L
 /// Opens the embedded store in `directory`.
 ///
 /// # Errors
-/// Another process has it open, it is damaged or of a later version, or the disk refuses.
+/// Another process has it open, it is damaged or of a later version, or the disk fails.
 pub fn open_store(
     directory: &Path,
     config: &StoreConfig,
@@ -122,8 +124,8 @@ pub fn open_store(
     Ok(Arc::new(store))
 }
 
-/// Serves where `config` says and drains once the process is asked to stop. `announce` is called
-/// with the address as soon as connections are taken.
+/// Serves on the address of `config`, and drains once the process is asked to stop. `announce` is
+/// called with the address as soon as connections are accepted.
 ///
 /// # Errors
 /// The server does not start.
@@ -137,19 +139,26 @@ pub fn serve_until_signal(
         .build()
         .map_err(ServerError::Runtime)?;
     let outcome = runtime.block_on(async {
-        let listen_error = |source| ServerError::Listen {
-            address: config.http.listen.clone(),
-            source,
-        };
-        let listener = TcpListener::bind(&config.http.listen)
-            .await
-            .map_err(listen_error)?;
-        announce(listener.local_addr().map_err(listen_error)?);
+        let listener = listen(&config.http.listen, announce).await?;
         run_server(listener, config, loaders, stop_requested()).await
     });
-    // Blocking work that outlived the drain must not keep the process alive.
+    // Blocking work that goes on after the drain must not keep the process alive.
     runtime.shutdown_timeout(BLOCKING_GRACE);
     outcome
+}
+
+/// Binds the listener and announces the address that it has.
+async fn listen(
+    address: &str,
+    announce: impl FnOnce(SocketAddr),
+) -> Result<TcpListener, ServerError> {
+    let failed = |source| ServerError::Listen {
+        address: address.to_owned(),
+        source,
+    };
+    let listener = TcpListener::bind(address).await.map_err(failed)?;
+    announce(listener.local_addr().map_err(failed)?);
+    Ok(listener)
 }
 
 /// Resolves when the process is asked to stop, and never if signals cannot be received.
@@ -179,11 +188,13 @@ pub async fn run_server(
         metrics.clone(),
         health.clone(),
     )?;
-    let disk_watch = tokio::spawn(watch_disk(config.clone(), health, metrics));
+    let watching = tokio::spawn(watch_disk(config.clone(), health, metrics));
+    let _watching = AbortOnDropHandle::new(watching);
     let opening = open(state.clone(), config, loaders);
     let serving = serve(listener, state, shutdown);
     tokio::pin!(serving);
-    let outcome = tokio::select! {
+    // A shutdown during start-up ends the server without waiting for the model and the store.
+    tokio::select! {
         biased;
         () = &mut serving => Ok(()),
         opened = opening => match opened {
@@ -193,16 +204,15 @@ pub async fn run_server(
             }
             Err(error) => Err(error),
         },
-    };
-    disk_watch.abort();
-    outcome
+    }
 }
 
-/// Opens the parts, starts the pipeline upon them, and lets requests in.
+/// Opens the model and the store, starts the pipeline on them, and lets requests in.
 async fn open(state: AppState, config: Config, loaders: Loaders) -> Result<(), ServerError> {
     let metrics = state.metrics.clone();
     let health = state.health.clone();
-    let service = spawn_blocking(move || start_service(config, loaders, metrics, health))
+    let starting = spawn_blocking(move || start_service(config, loaders, metrics, health));
+    let service = starting
         .await
         .map_err(|error| ServerError::Interrupted(error.to_string()))??;
     tracing::info!(model = %service.info().model, "ready");
@@ -231,7 +241,7 @@ fn start_service(
     Ok(service)
 }
 
-/// Keeps `disk_full` and the gauge of free bytes true to the disk.
+/// Brings the health and the gauge of free bytes up to date with the disk, again and again.
 async fn watch_disk(config: Config, health: Arc<Health>, metrics: Arc<Metrics>) {
     let reserve = config.pipeline.disk_reserve_bytes;
     loop {
@@ -240,6 +250,6 @@ async fn watch_disk(config: Config, health: Arc<Health>, metrics: Arc<Metrics>) 
             metrics.set_disk_free(space.free);
             health.set_disk_full(space.is_short_of(reserve));
         }
-        tokio::time::sleep(DISK_CHECK).await;
+        tokio::time::sleep(DISK_CHECK_INTERVAL).await;
     }
 }

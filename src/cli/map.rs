@@ -256,10 +256,12 @@ struct Projecting<'a> {
 impl HeadExchange for Projecting<'_> {
     fn project(&mut self, pooled: &[Vec<f32>]) -> Result<Vec<Vec<f32>>, StoreError> {
         self.bar.inc(pooled.len() as u64);
-        let globals = pooled
+        pooled
             .par_iter()
             .map(|pooled| self.head.project_stored(pooled))
-            .collect();
-        Ok(globals)
+            .collect::<Result<_, _>>()
+            .map_err(|error| StoreError::HeadNotApplied {
+                source: error.into(),
+            })
     }
 }

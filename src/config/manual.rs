@@ -1,253 +1,155 @@
-//! What every key means: the comments of the printed configuration.
+//! The manual of the configuration file.
+//!
+//! Every setting is explained in one place, the doc comment of its field. The schemas that `utoipa`
+//! derives from the settings structs carry those comments, so this module collects them from there
+//! and writes each one above its key.
+
+use serde_json::Value;
+use std::fmt::Write;
+use utoipa::ToSchema;
 
 /// The head of the printed file.
-pub(super) const INTRODUCTION: &str = "\
+const INTRODUCTION: &str = "\
 # PlaceFormer's settings as they are in force. Every key may be left out.
 # Each can also be set in the environment: PLACEFORMER_HTTP__LISTEN is `listen` of [http].
 # Flags win over the environment, the environment over this file, this file over the defaults.
 ";
 
-type Keys = &'static [(&'static str, &'static str)];
-
-/// Keys of a section with their explanations.
-pub(super) fn section(name: &str) -> Keys {
-    SECTIONS
-        .iter()
-        .find(|(section, _)| *section == name)
-        .map_or(&[], |(_, keys)| keys)
+/// One table of the configuration file.
+pub(super) struct Section {
+    /// Its name, such as `http`.
+    pub(super) name: String,
+    /// What its settings are about.
+    pub(super) explanation: String,
+    /// Its keys by name.
+    pub(super) settings: Vec<Setting>,
 }
 
-/// All sections.
-pub(super) const SECTIONS: &[(&str, Keys)] = &[
-    (
-        "data",
-        &[(
-            "directory",
-            "Directory of the store; made if it is not there. One process at a time.",
-        )],
-    ),
-    (
-        "store",
-        &[
-            (
-                "readers",
-                "Most reading connections open at once; further readers wait.",
-            ),
-            (
-                "cache_kib",
-                "Page cache of each connection; patches come through the system's cache.",
-            ),
-            (
-                "page_bytes",
-                "Size of a database page, a power of two from 4096 to 65536; fixed at creation.",
-            ),
-            (
-                "log_bytes",
-                "Size of the write-ahead log at which it is folded into the database.",
-            ),
-            (
-                "reserve_bytes",
-                "Room kept so that deletes succeed on a full disk (at most a quarter of what is left).",
-            ),
-            (
-                "queue",
-                "Writes that may wait for the writer; further ones block their caller.",
-            ),
-        ],
-    ),
-    (
-        "http",
-        &[
-            ("listen", "Address and port; port 0 picks a free one."),
-            (
-                "max_connections",
-                "Connections open at once; further ones wait in the kernel's backlog.",
-            ),
-            (
-                "header_timeout_ms",
-                "Time for a request's head to arrive, also between two requests of one connection.",
-            ),
-            ("body_timeout_ms", "Time for a whole body to arrive."),
-            ("body_idle_timeout_ms", "Longest pause within a body."),
-            ("max_header_bytes", "Largest head of a request."),
-            (
-                "max_buffered_bytes",
-                "Bytes of bodies held at once over all requests; beyond: 503 overloaded.",
-            ),
-            ("max_page", "Most references in one page of a listing."),
-            (
-                "drain_delay_ms",
-                "After SIGTERM: time between failing /readyz and refusing connections.",
-            ),
-            (
-                "drain_timeout_ms",
-                "After SIGTERM: time for requests under way to finish.",
-            ),
-        ],
-    ),
-    (
-        "auth",
-        &[
-            (
-                "keys",
-                "Accepted API keys; none: the service is open. Each has a name, the SHA-256 of the key\n\
-                 (printf %s KEY | sha256sum), a role (\"read\" or \"write\") and, if it differs, its own\n\
-                 requests_per_second.",
-            ),
-            ("protect_metrics", "Whether /metrics needs a key, too."),
-            (
-                "requests_per_second",
-                "Pace of one key (of one address without keys); 0: unbounded.",
-            ),
-            (
-                "burst",
-                "Requests that may come at once beyond that pace; 0: as many as a second's.",
-            ),
-        ],
-    ),
-    (
-        "pipeline",
-        &[
-            (
-                "queue_capacity",
-                "Queries, and beside them references, waiting or in compute; beyond: 503 overloaded.",
-            ),
-            (
-                "max_wait_ms",
-                "Longest wait of a query for its turn; one that would wait longer gets 503 at once.",
-            ),
-            (
-                "store_reads",
-                "Listings and look-ups at the store at once, at least two fewer than store.readers: those are\n\
-                 left to queries and changes. Without a turn within max_wait_ms: 503 overloaded.",
-            ),
-            (
-                "store_writes",
-                "Changes and deletions under way at once, with the same wait.",
-            ),
-            (
-                "patch_cache_bytes",
-                "Key patches kept in memory for the next query.",
-            ),
-            ("top_k", "Results of a query that does not say."),
-            (
-                "candidates",
-                "Candidates re-ranked for a query that does not say.",
-            ),
-            (
-                "max_candidates",
-                "Most results or candidates a query may ask for.",
-            ),
-            (
-                "deadline_ms",
-                "Time for a query that does not say, and the most it may ask for.",
-            ),
-            (
-                "answer_reserve_ms",
-                "Part of a query's time kept back for writing the answer.",
-            ),
-            (
-                "memory_watermark_bytes",
-                "Resident bytes above which nothing new is taken in; 0: 85% of what the process may use.",
-            ),
-            (
-                "disk_reserve_bytes",
-                "Free bytes on the store's disk below which nothing new is taken in, so that deletions\n\
-                 have room; at most a twentieth of the disk.",
-            ),
-            (
-                "max_metadata_bytes",
-                "Longest metadata of a reference, as JSON.",
-            ),
-        ],
-    ),
-    (
-        "image",
-        &[
-            ("max_bytes", "Largest image in bytes."),
-            ("max_side", "Longest side in pixels."),
-            ("max_pixels", "Most pixels."),
-        ],
-    ),
-    (
-        "extract",
-        &[
-            (
-                "preset",
-                "The backbone: dinov2-vits14, dinov2-vitb14, dinov2-vitl14 or placeformer-vits16.",
-            ),
-            (
-                "weights",
-                "Weights file of your own for that backbone (safetensors by timm, DINO or Hugging Face names, or what\n\
-                 `train` wrote); the published ones, pulled on first use, unless set.",
-            ),
-            (
-                "input_size",
-                "Images are squashed to this, each side a multiple of the patch size; the preset's own.",
-            ),
-            (
-                "exit_block",
-                "0-based block whose tokens are used; later ones are not computed; the preset's own.",
-            ),
-            (
-                "token_norm",
-                "Whether the tokens pass the final LayerNorm; the preset's own.",
-            ),
-            (
-                "attention_block",
-                "0-based block whose CLS attention ranks patches; the exit block.",
-            ),
-            (
-                "heads",
-                "Attention heads, for weights trained with another count than the preset's.",
-            ),
-            (
-                "tau",
-                "Key patches must exceed this multiple of the uniform attention; 1 is the paper's 0.01.",
-            ),
-            ("caps", "Most key patches at scales 1, 2 and 3."),
-            (
-                "stride",
-                "Distance between fused windows: \"kernel\" (no overlap) or \"one\" (every patch).",
-            ),
-            (
-                "head",
-                "Projection to the global descriptor: \"default\" (the one built in for the backbone and its published\n\
-                 weights) or a file, as `head fit`, `head train` or `train` wrote it. \"none\" is for evaluation only.",
-            ),
-            (
-                "precision",
-                "Arithmetic of the transformer: f32, bf16, int8, mixed (int8 in the blocks where it shows least, bf16 in the\n\
-                 others), or auto (mixed where the CPU has AVX-512 VNNI, else f32).",
-            ),
-        ],
-    ),
-    (
-        "rerank",
-        &[
-            (
-                "scales",
-                "Scale combinations whose inliers add up to S; the paper's best row is 1, 1+2, 2+3.",
-            ),
-            ("tolerance_patches", "Inlier tolerance in base patches."),
-            (
-                "max_iterations",
-                "Most homographies tried for one combination.",
-            ),
-            (
-                "confidence",
-                "Probability of having seen the best homography at which the search stops.",
-            ),
-        ],
-    ),
-    (
-        "log",
-        &[
-            ("format", "\"human\" or \"json\" (one object a line)."),
-            (
-                "filter",
-                "What is logged: \"info\", \"placeformer=debug\", ...",
-            ),
-        ],
-    ),
-];
+/// One key of a section.
+pub(super) struct Setting {
+    /// Its name, such as `listen`.
+    pub(super) name: String,
+    /// What it means: one or more lines.
+    pub(super) explanation: String,
+}
+
+/// The sections of `T`, a struct whose fields are the structs of the sections.
+pub(super) fn sections<T: ToSchema>() -> Vec<Section> {
+    let schemas = Schemas::of::<T>();
+    let sections = properties(&schemas.root).map(|(name, field)| {
+        let settings = schemas.referenced(field).into_iter().flat_map(properties);
+        Section {
+            name: name.clone(),
+            explanation: description(field),
+            settings: settings
+                .map(|(name, field)| Setting {
+                    name: name.clone(),
+                    explanation: schemas.explanation(field),
+                })
+                .collect(),
+        }
+    });
+    sections.collect()
+}
+
+/// `values` as TOML, each key under its explanation. Keys without a value are commented out.
+pub(super) fn annotated(values: &toml::Table, sections: &[Section]) -> String {
+    let mut text = String::from(INTRODUCTION);
+    for section in sections {
+        text.push('\n');
+        push_comment(&mut text, &section.explanation);
+        push_line(&mut text, format_args!("[{}]", section.name));
+
+        let values = values.get(&section.name).and_then(toml::Value::as_table);
+        let value_of = |setting: &Setting| values.and_then(|values| values.get(&setting.name));
+        let (set, unset): (Vec<_>, Vec<_>) = section
+            .settings
+            .iter()
+            .partition(|setting| value_of(setting).is_some());
+        for setting in set.into_iter().chain(unset) {
+            push_comment(&mut text, &setting.explanation);
+            match value_of(setting) {
+                Some(value) => push_line(&mut text, format_args!("{} = {value}", setting.name)),
+                None => push_line(&mut text, format_args!("# {} =", setting.name)),
+            }
+        }
+    }
+    text
+}
+
+fn push_comment(text: &mut String, comment: &str) {
+    for line in comment.lines() {
+        push_line(text, format_args!("# {line}"));
+    }
+}
+
+fn push_line(text: &mut String, line: std::fmt::Arguments<'_>) {
+    // Writing to a string cannot fail.
+    let _ = writeln!(text, "{line}");
+}
+
+/// The JSON schemas of a struct and of everything it refers to.
+struct Schemas {
+    root: Value,
+    by_name: Vec<(String, Value)>,
+}
+
+impl Schemas {
+    fn of<T: ToSchema>() -> Self {
+        // A schema consists of maps with text keys, which JSON can always express.
+        let as_json = |schema| serde_json::to_value(schema).unwrap_or_default();
+        let mut named = Vec::new();
+        T::schemas(&mut named);
+        Self {
+            root: as_json(T::schema()),
+            by_name: named
+                .into_iter()
+                .map(|(name, schema)| (name, as_json(schema)))
+                .collect(),
+        }
+    }
+
+    /// The struct that a field is of, if the field refers to one.
+    fn referenced(&self, field: &Value) -> Option<&Value> {
+        let reference = find_reference(field)?;
+        let wanted = reference.rsplit('/').next()?;
+        let (_, schema) = self.by_name.iter().find(|(name, _)| name == wanted)?;
+        Some(schema)
+    }
+
+    /// The doc comment of a field, followed by those of its own fields if it is a list of structs.
+    fn explanation(&self, field: &Value) -> String {
+        let mut text = description(field);
+        let Some(element) = self.referenced(field) else {
+            return text;
+        };
+        text.push_str("\nEach of them has");
+        for (name, inner) in properties(element) {
+            let explanation = description(inner).replace('\n', "\n  ");
+            // Writing to a string cannot fail.
+            let _ = write!(text, "\n  {name}: {explanation}");
+        }
+        text
+    }
+}
+
+fn properties(schema: &Value) -> impl Iterator<Item = (&String, &Value)> {
+    schema["properties"].as_object().into_iter().flatten()
+}
+
+fn description(schema: &Value) -> String {
+    let text = schema["description"].as_str().unwrap_or_default();
+    text.to_owned()
+}
+
+/// The first `$ref` within a field's schema: a list or an optional field wraps it.
+fn find_reference(schema: &Value) -> Option<&str> {
+    match schema {
+        Value::Object(fields) => match fields.get("$ref") {
+            Some(reference) => reference.as_str(),
+            None => fields.values().find_map(find_reference),
+        },
+        Value::Array(elements) => elements.iter().find_map(find_reference),
+        _ => None,
+    }
+}

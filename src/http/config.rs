@@ -2,12 +2,14 @@
 
 use placeformer_core::types::InvalidValue;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
-/// Limits and timeouts of connections and bodies.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// Limits and timeouts of connections and bodies. The comments of the fields are printed as the
+/// manual of the configuration file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct HttpConfig {
-    /// Address and port; port 0 picks a free one.
+    /// Address and port to listen on; port 0 picks a free one.
     pub listen: String,
     /// Connections open at once; further ones wait in the kernel's backlog.
     pub max_connections: usize,
@@ -18,16 +20,17 @@ pub struct HttpConfig {
     pub body_timeout_ms: u64,
     /// Longest pause within a body, in milliseconds.
     pub body_idle_timeout_ms: u64,
-    /// Largest head in bytes.
+    /// Largest head of a request in bytes, at least 8192.
     pub max_header_bytes: usize,
-    /// Bytes of bodies held at once over all requests.
+    /// Bytes of bodies kept in memory at once over all requests; beyond, a request is answered 503
+    /// overloaded.
     pub max_buffered_bytes: usize,
     /// Most references in one page of a listing.
     pub max_page: usize,
-    /// Time between failing readiness and refusing connections, in milliseconds: a balancer notices
-    /// meanwhile.
+    /// After SIGTERM: time between failing /readyz and refusing connections, in milliseconds, so
+    /// that a load balancer notices.
     pub drain_delay_ms: u64,
-    /// Time for requests under way to finish when stopping, in milliseconds.
+    /// After SIGTERM: time for requests under way to finish, in milliseconds.
     pub drain_timeout_ms: u64,
 }
 
@@ -72,17 +75,18 @@ impl HttpConfig {
     }
 }
 
-/// Who may do what. Without keys the service is open.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+/// Who may do what. Without keys the service is open. The comments of the fields are printed as the
+/// manual of the configuration file.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct AuthConfig {
-    /// The keys that are accepted.
+    /// Accepted API keys; without any, the service is open to everyone.
     pub keys: Vec<ApiKey>,
-    /// Whether `/metrics` needs a key, too.
+    /// Whether /metrics needs a key, too.
     pub protect_metrics: bool,
-    /// Requests per second of one key (of one address without keys); 0 is without bound.
+    /// Requests per second of one key (of one address where there are no keys); 0 is unbounded.
     pub requests_per_second: u32,
-    /// Requests that may come at once beyond that pace; 0 is as many as a second's.
+    /// Requests that may come at once beyond that rate; 0 is as many as one second allows.
     pub burst: u32,
 }
 
@@ -97,16 +101,17 @@ pub enum Role {
 }
 
 /// One accepted key. The key itself is nowhere kept.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ApiKey {
-    /// Who holds it; appears in logs.
+    /// Who uses it; appears in logs.
     pub name: String,
-    /// SHA-256 of the key in hexadecimal.
+    /// SHA-256 of the key in hexadecimal (printf %s KEY | sha256sum).
     pub sha256: String,
-    /// What it allows.
+    /// "read" (queries, matches and listings) or "write" (everything).
+    #[schema(value_type = String)]
     pub role: Role,
-    /// Its own pace, if it differs.
+    /// Requests per second of this key, if they differ from those of the others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub requests_per_second: Option<u32>,
 }

@@ -1,4 +1,4 @@
-//! Room on the disk that holds the store.
+//! Free space on the disk of the store.
 
 use std::io;
 use std::path::Path;
@@ -6,13 +6,16 @@ use std::path::Path;
 /// Space on a file system, in bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DiskSpace {
-    /// Free to unprivileged users.
+    /// Free to users without privileges.
     pub free: u64,
-    /// In all.
+    /// Size of the file system.
     pub total: u64,
 }
 
-/// Asks the file system that holds `path`.
+/// Asks the file system on which `path` is.
+///
+/// # Errors
+/// The path is not there, or the system refuses.
 pub fn space(path: &Path) -> io::Result<DiskSpace> {
     let stat = rustix::fs::statvfs(path)?;
     Ok(DiskSpace {
@@ -22,7 +25,8 @@ pub fn space(path: &Path) -> io::Result<DiskSpace> {
 }
 
 impl DiskSpace {
-    /// Whether less than `reserve` is free; on a small disk less than a twentieth of it.
+    /// Whether less than `reserve` bytes are free. On a small disk the bound is a twentieth of it,
+    /// so that the reserve does not take the whole disk.
     pub fn is_short_of(&self, reserve: u64) -> bool {
         self.free < reserve.min(self.total / 20)
     }

@@ -1,11 +1,11 @@
 //! Whether the server is ready, and if not, why.
 //!
-//! One [`Health`] is shared by everything. Start-up moves it forward phase by phase, shutdown turns
-//! it to draining, and a full disk holds it back while it lasts. `/readyz` prints the first reason
-//! found; `/readyz?for=query` leaves the disk out.
+//! The whole process shares one [`Health`]. Start-up moves it from phase to phase, shutdown sets it
+//! to draining, and a full disk makes it unready until there is room again. `/readyz` prints the
+//! first reason found; `/readyz?for=query` ignores the disk, because queries need no room on it.
 
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Why the server is not ready.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -23,7 +23,7 @@ pub enum Unready {
     },
     /// Stopping: requests under way are finished, new ones go elsewhere.
     Draining,
-    /// The disk is (almost) full: queries are answered, nothing new is stored.
+    /// The disk is almost full: queries are answered, but nothing new is stored.
     DiskFull,
 }
 
@@ -40,6 +40,7 @@ impl Unready {
     }
 }
 
+/// How far start-up has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
     LoadingModel,
@@ -52,7 +53,9 @@ enum Phase {
 #[derive(Debug)]
 pub struct Health {
     phase: Mutex<Phase>,
+    /// References indexed since start-up began.
     indexed: AtomicU64,
+    /// References in the store at that time.
     to_index: AtomicU64,
     draining: AtomicBool,
     disk_full: AtomicBool,
@@ -71,7 +74,7 @@ impl Default for Health {
 }
 
 impl Health {
-    /// The weights are in memory; the store is next.
+    /// The weights are in memory, and the store is being opened.
     pub fn migrating(&self) {
         self.enter(Phase::Migrating);
     }
@@ -87,7 +90,7 @@ impl Health {
         self.indexed.fetch_add(count, Ordering::Relaxed);
     }
 
-    /// Everything is loaded.
+    /// Everything is loaded, and requests are served.
     pub fn serving(&self) {
         self.enter(Phase::Serving);
     }
@@ -124,17 +127,13 @@ impl Health {
             .or_else(|| self.is_disk_full().then_some(Unready::DiskFull))
     }
 
-    /// The reason for not answering queries, which a full disk is not; `None` when they are
-    /// answered.
+    /// The reason for not answering queries; `None` when they are answered. A full disk is no
+    /// reason.
     pub fn unready_for_queries(&self) -> Option<Unready> {
         if self.is_draining() {
             return Some(Unready::Draining);
         }
-        match *self
-            .phase
-            .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner)
-        {
+        match *self.phase() {
             Phase::LoadingModel => Some(Unready::LoadingModel),
             Phase::Migrating => Some(Unready::Migrating),
             Phase::BuildingIndex => Some(Unready::BuildingIndex {
@@ -146,11 +145,13 @@ impl Health {
     }
 
     fn enter(&self, phase: Phase) {
-        *self
-            .phase
-            .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner) = phase;
+        *self.phase() = phase;
         tracing::debug!(?phase, "start-up");
+    }
+
+    fn phase(&self) -> MutexGuard<'_, Phase> {
+        // The phase is whole even if a thread panicked while it had the lock.
+        self.phase.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

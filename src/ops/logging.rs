@@ -1,10 +1,11 @@
-//! Logs: for people on a terminal, or one JSON object a line for collectors.
+//! Logs: text for people, or one JSON object a line for collectors.
 
 use serde::{Deserialize, Serialize};
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::panic::PanicHookInfo;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
+use utoipa::ToSchema;
 
 /// How log lines look.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
@@ -17,13 +18,15 @@ pub enum LogFormat {
     Json,
 }
 
-/// Settings of the logs.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// Settings of the logs. The comments of the fields are printed as the manual of the
+/// configuration file.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct LogConfig {
-    /// Text or JSON.
+    /// "human" (coloured text) or "json" (one object a line).
+    #[schema(value_type = String)]
     pub format: LogFormat,
-    /// Filter in the syntax of `tracing` directives: `info`, `placeformer=debug`, ...
+    /// What is logged, in the syntax of `tracing` directives: "info", "placeformer=debug", ...
     pub filter: String,
 }
 
@@ -36,7 +39,7 @@ impl Default for LogConfig {
     }
 }
 
-/// The filter text is not a list of directives.
+/// The log filter is not a list of directives.
 #[derive(Debug, thiserror::Error)]
 #[error("log.filter {filter:?} is not valid: {reason}")]
 pub struct InvalidFilter {
@@ -46,6 +49,9 @@ pub struct InvalidFilter {
 
 impl LogConfig {
     /// Checks the filter.
+    ///
+    /// # Errors
+    /// It is not a list of directives.
     pub fn check(&self) -> Result<(), InvalidFilter> {
         self.directives().map(drop)
     }
@@ -58,8 +64,11 @@ impl LogConfig {
     }
 }
 
-/// Sends all events, and the text of panics, to standard error from now on. A second call keeps the
-/// first one's settings.
+/// Sends all events and the text of panics to standard error from now on. After a second call the
+/// settings of the first one stay in force.
+///
+/// # Errors
+/// The filter is not a list of directives.
 pub fn init(config: &LogConfig) -> Result<(), InvalidFilter> {
     let lines = tracing_subscriber::fmt()
         .with_env_filter(config.directives()?)
@@ -81,12 +90,12 @@ pub fn init(config: &LogConfig) -> Result<(), InvalidFilter> {
     Ok(())
 }
 
-/// A panic is an event like any other: one line, in the format of the others, with the request it
-/// happened in.
+/// Logs a panic as an event: one line in the format of the others, with the request during which it
+/// happened.
 fn log_panic(panic: &PanicHookInfo<'_>) {
     let backtrace = Backtrace::capture();
-    let backtrace =
-        (backtrace.status() == BacktraceStatus::Captured).then(|| backtrace.to_string());
+    let captured = backtrace.status() == BacktraceStatus::Captured;
+    let backtrace = captured.then(|| backtrace.to_string());
     let location = panic.location().map(ToString::to_string);
     tracing::error!(
         panic = panic.payload_as_str().unwrap_or("no text"),

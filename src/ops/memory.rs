@@ -1,7 +1,7 @@
-//! How much memory the process holds, and how much it may.
+//! How much memory the process uses, and how much it may use.
 
 use std::fs;
-use std::sync::Mutex;
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Resident bytes of this process; `None` where the kernel does not say.
@@ -15,32 +15,34 @@ pub fn limit_bytes() -> Option<u64> {
     let machine = fs::read_to_string("/proc/meminfo")
         .ok()
         .and_then(|text| kib_field(&text, "MemTotal:"));
-    let group = [
+    // Version 2 of control groups, then version 1.
+    let limits = [
         "/sys/fs/cgroup/memory.max",
         "/sys/fs/cgroup/memory/memory.limit_in_bytes",
-    ]
-    .iter()
-    .find_map(|path| fs::read_to_string(path).ok()?.trim().parse().ok());
+    ];
+    let group = limits
+        .iter()
+        .find_map(|path| fs::read_to_string(path).ok()?.trim().parse().ok());
     match (machine, group) {
         (Some(machine), Some(group)) => Some(u64::min(machine, group)),
         (machine, group) => machine.or(group),
     }
 }
 
+/// A field in bytes of a file of the kernel whose lines look like `VmRSS:   12 kB`.
 fn kib_field(text: &str, name: &str) -> Option<u64> {
-    let line = text.lines().find_map(|line| line.strip_prefix(name))?;
-    line.trim()
-        .trim_end_matches("kB")
-        .trim()
-        .parse::<u64>()
-        .ok()
-        .map(|kib| kib * 1024)
+    let value = text.lines().find_map(|line| line.strip_prefix(name))?;
+    let kib: u64 = value.trim().trim_end_matches("kB").trim().parse().ok()?;
+    Some(kib * 1024)
 }
 
-/// Says whether memory is short; reads the kernel's figure at most four times a second.
+/// A bound on resident memory. Reads the kernel's figure at most four times a second, because every
+/// new reference asks.
 #[derive(Debug)]
 pub struct MemoryWatermark {
+    /// In bytes; `None` where the kernel does not say how much the process may use.
     watermark: Option<u64>,
+    /// When the kernel was asked last, and the resident bytes it gave.
     last: Mutex<Option<(Instant, u64)>>,
 }
 
@@ -70,7 +72,10 @@ impl MemoryWatermark {
         }
     }
 
-    /// Fails while the process holds more than the bound.
+    /// Compares resident memory with the bound.
+    ///
+    /// # Errors
+    /// More bytes are resident than the bound allows.
     pub fn check(&self) -> Result<(), MemoryShort> {
         let Some(watermark) = self.watermark else {
             return Ok(());
@@ -85,10 +90,7 @@ impl MemoryWatermark {
     }
 
     fn resident(&self) -> Option<u64> {
-        let mut last = self
-            .last
-            .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner);
+        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((read, bytes)) = *last
             && read.elapsed() < Self::READ_EVERY
         {

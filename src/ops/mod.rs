@@ -1,7 +1,7 @@
-//! What operators see and touch: metrics, logs, health, memory, shutdown.
+//! What operators watch and control: metrics, logs, health, memory and disk, shutdown.
 //!
-//! Nothing here knows the web or the stages; `pipeline` and `http` write into [`Metrics`] and
-//! [`Health`], the HTTP surface reads them out.
+//! Nothing here knows the web or the stages. `pipeline` and `http` write into [`Metrics`] and
+//! [`Health`], and the HTTP surface shows them.
 
 pub mod disk;
 pub mod health;
@@ -12,4 +12,4 @@ pub mod shutdown;
 
 pub use health::{Health, Unready};
 pub use logging::{LogConfig, LogFormat};
-pub use metrics::{Metrics, Stage};
+pub use metrics::{Metrics, PipelineStage};

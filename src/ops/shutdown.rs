@@ -4,13 +4,14 @@ use tokio::signal::unix::{SignalKind, signal};
 
 /// Waits for the first SIGTERM or SIGINT.
 ///
-/// Cancel safety: the handlers are installed on the first poll; dropping it forgets a signal that
-/// came in between.
+/// Cancel safety: the handlers are installed on the first poll; a signal that arrived before the
+/// future is dropped is lost.
+///
+/// # Errors
+/// A signal handler cannot be installed.
 pub async fn requested() -> std::io::Result<()> {
-    let (mut terminate, mut interrupt) = (
-        signal(SignalKind::terminate())?,
-        signal(SignalKind::interrupt())?,
-    );
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut interrupt = signal(SignalKind::interrupt())?;
     let name = tokio::select! {
         _ = terminate.recv() => "SIGTERM",
         _ = interrupt.recv() => "SIGINT",

@@ -1,39 +1,46 @@
-//! The door: how many requests may wait for or be in compute at once, and for how long.
+//! Bounds on how many requests wait for or are in compute at once, and for how long.
 //!
-//! Waiting costs memory and, worse, time that the caller may not have. A request whose turn would
-//! come too late, by the pace at which others leave, is refused at once with the time after which
-//! it is worth trying again; so what is let in is answered soon, however much is asked.
+//! Waiting costs memory and, worse, time that the caller may not have. A request that would have to
+//! wait too long, judged by how fast the requests before it leave, is refused at once with the time
+//! after which it is worth trying again. So whatever is admitted is answered soon, no matter how
+//! many requests arrive.
 //!
-//! Queries and ingest each have a door of their own: a bulk import must not turn vehicles away.
-//! What needs only the store (listings, look-ups, changes) waits for one of a few [`Turns`], so
-//! that it never takes all the threads and connections that queries need.
+//! Queries and new references each have an [`Admission`] of their own, because a bulk import must
+//! not keep vehicles from being answered. Requests that need only the store (listings, look-ups,
+//! changes) wait for a [`ConcurrencyLimit`], so that they never take all the threads and
+//! connections that queries need.
 
 use super::PipelineError;
 use crate::ops::Metrics;
 use crate::ops::metrics::Rejection;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout;
 
-/// Requests let in while nothing is known about the pace yet.
-const PLACES_AT_UNKNOWN_PACE: usize = 8;
+/// Requests admitted while it is not known yet how fast they leave.
+const ADMITTED_AT_UNKNOWN_RATE: usize = 8;
 
+/// Shortest and longest advice to a refused caller.
+const RETRY_AFTER: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(30)];
+
+/// A bounded queue in front of the compute worker.
 pub(super) struct Admission {
     places: Arc<Semaphore>,
     capacity: usize,
     /// Smoothed time between two departures in microseconds, while busy; 0 before the first.
-    departure_us: AtomicU64,
+    departure_interval_us: AtomicU64,
     last_departure: Mutex<Instant>,
     metrics: Arc<Metrics>,
 }
 
 /// A place in the queue; given back when dropped.
 pub(super) struct Ticket {
+    /// Taken out by `drop`, so that the place is free before the departure is counted.
     place: Option<OwnedSemaphorePermit>,
     admission: Arc<Admission>,
-    entered: Instant,
+    admitted_at: Instant,
 }
 
 impl Admission {
@@ -41,21 +48,23 @@ impl Admission {
         Arc::new(Self {
             places: Arc::new(Semaphore::new(capacity)),
             capacity,
-            departure_us: AtomicU64::new(0),
+            departure_interval_us: AtomicU64::new(0),
             last_departure: Mutex::new(Instant::now()),
             metrics,
         })
     }
 
-    /// Takes a place if the turn will come within `patience`, or says when to come back.
-    pub(super) fn enter(self: &Arc<Self>, patience: Duration) -> Result<Ticket, PipelineError> {
-        let inside = self.depth();
-        let pace = self.departure_us.load(Ordering::Relaxed);
-        let wait = Duration::from_micros(pace.saturating_mul(inside as u64));
-        let too_late = if pace == 0 {
-            inside >= PLACES_AT_UNKNOWN_PACE && patience < Duration::MAX
-        } else {
-            wait > patience
+    /// Takes a place in the queue if the request is expected to be served within `max_wait`;
+    /// [`Duration::MAX`] stands for any time at all.
+    ///
+    /// # Errors
+    /// The queue is full or too slow; the error says when to come back.
+    pub(super) fn admit(self: &Arc<Self>, max_wait: Duration) -> Result<Ticket, PipelineError> {
+        let waiting = self.depth();
+        let expected_wait = self.expected_wait(waiting);
+        let too_late = match expected_wait {
+            Some(wait) => wait > max_wait,
+            None => waiting >= ADMITTED_AT_UNKNOWN_RATE && max_wait < Duration::MAX,
         };
         match self.places.clone().try_acquire_owned() {
             Ok(place) if !too_late => {
@@ -63,83 +72,99 @@ impl Admission {
                 Ok(Ticket {
                     place: Some(place),
                     admission: self.clone(),
-                    entered: Instant::now(),
+                    admitted_at: Instant::now(),
                 })
             }
             _ => {
                 self.metrics.rejected(Rejection::QueueFull);
                 Err(PipelineError::Overloaded {
-                    waiting: inside,
-                    retry_after: come_back_after(wait, patience),
+                    waiting,
+                    retry_after: retry_after(expected_wait.unwrap_or_default(), max_wait),
                 })
             }
         }
     }
 
-    /// Requests inside.
+    /// Requests admitted and not yet departed.
     fn depth(&self) -> usize {
         self.capacity - self.places.available_permits()
     }
 
-    fn departed(&self, entered: Instant) {
+    /// Time until `waiting` requests have departed; `None` before the first departure.
+    fn expected_wait(&self, waiting: usize) -> Option<Duration> {
+        match self.departure_interval_us.load(Ordering::Relaxed) {
+            0 => None,
+            interval => {
+                let wait = interval.saturating_mul(waiting as u64);
+                Some(Duration::from_micros(wait))
+            }
+        }
+    }
+
+    /// Counts a departure into the smoothed interval between departures.
+    fn departed(&self, admitted_at: Instant) {
         let now = Instant::now();
         let mut last = self
             .last_departure
             .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner);
-        // Idle time before this request came says nothing about the pace.
-        let gap = now
-            .saturating_duration_since((*last).max(entered))
-            .as_micros() as u64;
+            .unwrap_or_else(PoisonError::into_inner);
+        // The server may have been idle before this request came, and idle time says nothing about
+        // how long requests take.
+        let busy_since = (*last).max(admitted_at);
+        let interval = now.saturating_duration_since(busy_since).as_micros() as u64;
         *last = now;
-        let smoothed = self.departure_us.load(Ordering::Relaxed);
-        let next = if smoothed == 0 {
-            gap
-        } else {
-            (smoothed * 7 + gap) / 8
+
+        let smoothed = match self.departure_interval_us.load(Ordering::Relaxed) {
+            0 => interval,
+            smoothed => (smoothed * 7 + interval) / 8,
         };
-        self.departure_us.store(next.max(1), Ordering::Relaxed);
+        self.departure_interval_us
+            .store(smoothed.max(1), Ordering::Relaxed);
     }
 }
 
-/// Until half of what waits too long has left, 1 to 30 seconds.
-fn come_back_after(wait: Duration, patience: Duration) -> Duration {
-    let beyond = wait.saturating_sub(patience.min(wait) / 2);
-    beyond.clamp(Duration::from_secs(1), Duration::from_secs(30))
+/// When a refused caller should come back: after the time in which the expected wait shrinks to
+/// half of the longest one that it accepts.
+fn retry_after(expected_wait: Duration, max_wait: Duration) -> Duration {
+    let acceptable = max_wait.min(expected_wait) / 2;
+    let [shortest, longest] = RETRY_AFTER;
+    expected_wait
+        .saturating_sub(acceptable)
+        .clamp(shortest, longest)
 }
 
 impl Drop for Ticket {
     fn drop(&mut self) {
         self.place.take();
-        self.admission.departed(self.entered);
+        self.admission.departed(self.admitted_at);
         self.admission.metrics.queue_left();
     }
 }
 
-/// A few places that are taken in turn, first come, first served.
-pub(super) struct Turns {
-    places: Arc<Semaphore>,
+/// A bound on requests that use the store at once. The first to wait is the first to be served.
+pub(super) struct ConcurrencyLimit {
+    permits: Arc<Semaphore>,
     metrics: Arc<Metrics>,
 }
 
-impl Turns {
-    pub(super) fn new(places: usize, metrics: Arc<Metrics>) -> Self {
+impl ConcurrencyLimit {
+    pub(super) fn new(at_once: usize, metrics: Arc<Metrics>) -> Self {
         Self {
-            places: Arc::new(Semaphore::new(places)),
+            permits: Arc::new(Semaphore::new(at_once)),
             metrics,
         }
     }
 
-    /// Waits for a place, but not longer than `patience`. It is given back when dropped.
+    /// Waits for a permit, but not longer than `max_wait`. It is given back when dropped.
     ///
-    /// Cancel safety: who is dropped while waiting leaves the line.
-    pub(super) async fn take(
+    /// Cancel safety: dropped while waiting, the request leaves the queue.
+    pub(super) async fn acquire(
         &self,
-        patience: Duration,
+        max_wait: Duration,
     ) -> Result<OwnedSemaphorePermit, PipelineError> {
-        match timeout(patience, self.places.clone().acquire_owned()).await {
+        match timeout(max_wait, self.permits.clone().acquire_owned()).await {
             // The semaphore is never closed.
-            Ok(place) => place.map_err(|_| PipelineError::ShuttingDown),
+            Ok(permit) => permit.map_err(|_| PipelineError::ShuttingDown),
             Err(_) => {
                 self.metrics.rejected(Rejection::StoreBusy);
                 Err(PipelineError::StoreBusy)
@@ -157,49 +182,53 @@ mod tests {
     }
 
     #[test]
-    fn the_door_closes_when_full_and_opens_again() {
+    fn a_full_queue_refuses_until_a_place_is_given_back() {
         let admission = admission(2);
-        let first = admission.enter(Duration::MAX).ok().unwrap();
-        let _second = admission.enter(Duration::MAX).ok().unwrap();
+        let first = admission.admit(Duration::MAX).ok().unwrap();
+        let _second = admission.admit(Duration::MAX).ok().unwrap();
         assert_eq!(admission.depth(), 2);
-        let Err(refused) = admission.enter(Duration::MAX) else {
-            panic!("a third was let in")
+        let Err(refused) = admission.admit(Duration::MAX) else {
+            panic!("a third was admitted")
         };
         assert!(refused.retry_after().unwrap() >= Duration::from_secs(1));
         drop(first);
-        assert!(admission.enter(Duration::MAX).is_ok());
+        assert!(admission.admit(Duration::MAX).is_ok());
     }
 
     #[test]
-    fn who_would_wait_too_long_is_refused_and_who_finds_nobody_is_not() {
+    fn a_request_that_would_wait_too_long_is_refused_unless_the_queue_is_empty() {
         let admission = admission(100);
-        admission.departure_us.store(300_000, Ordering::Relaxed);
-        let patience = Duration::from_secs(1);
-        let inside: Vec<_> = (0..4)
-            .map(|_| admission.enter(patience).ok().unwrap())
+        admission
+            .departure_interval_us
+            .store(300_000, Ordering::Relaxed);
+        let max_wait = Duration::from_secs(1);
+        let admitted: Vec<_> = (0..4)
+            .map(|_| admission.admit(max_wait).ok().unwrap())
             .collect();
-        let Err(refused) = admission.enter(patience) else {
+        let Err(refused) = admission.admit(max_wait) else {
             panic!("a fifth would wait 1.2 s")
         };
         assert_eq!(refused.retry_after(), Some(Duration::from_secs(1)));
         assert!(
-            admission.enter(Duration::from_secs(2)).is_ok(),
-            "the more patient are let in"
+            admission.admit(Duration::from_secs(2)).is_ok(),
+            "a request with more time is admitted"
         );
-        drop(inside);
-        admission.departure_us.store(60_000_000, Ordering::Relaxed);
+        drop(admitted);
+        admission
+            .departure_interval_us
+            .store(60_000_000, Ordering::Relaxed);
         assert!(
-            admission.enter(patience).is_ok(),
+            admission.admit(max_wait).is_ok(),
             "an idle server always tries"
         );
     }
 
     #[test]
-    fn a_burst_at_unknown_pace_is_bounded() {
+    fn a_burst_at_unknown_rate_is_bounded() {
         let admission = admission(100);
-        let inside: Vec<_> = (0..20)
-            .map_while(|_| admission.enter(Duration::from_secs(1)).ok())
+        let admitted: Vec<_> = (0..20)
+            .map_while(|_| admission.admit(Duration::from_secs(1)).ok())
             .collect();
-        assert_eq!(inside.len(), PLACES_AT_UNKNOWN_PACE);
+        assert_eq!(admitted.len(), ADMITTED_AT_UNKNOWN_RATE);
     }
 }

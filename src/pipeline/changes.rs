@@ -2,38 +2,48 @@
 
 use super::maps::Change;
 use super::{PipelineError, Service};
-use placeformer_core::types::{Calibration, MapName, Reference, ReferenceFields, ReferenceId};
+use placeformer_core::types::{Calibration, MapName, Reference, ReferenceId};
 use placeformer_store::{ReferencePatch, StoreError};
 use std::sync::Arc;
 
 impl Service {
     /// Changes a reference's metadata; its image and descriptor stay.
+    ///
+    /// # Errors
+    /// The metadata is too long, there is no such reference, or the store fails.
     pub async fn update(
         self: &Arc<Self>,
         id: ReferenceId,
         patch: ReferencePatch,
     ) -> Result<Reference, PipelineError> {
-        let metadata = patch.metadata.clone().flatten();
-        self.check_metadata(&ReferenceFields {
-            metadata,
-            ..Default::default()
-        })?;
+        let metadata = patch.metadata.as_ref().and_then(Option::as_ref);
+        self.check_metadata(metadata)?;
         self.write(move |service| service.update_now(id, patch))
             .await
     }
 
     /// Deletes a reference and returns what it was.
+    ///
+    /// # Errors
+    /// There is no such reference, or the store fails.
     pub async fn delete(self: &Arc<Self>, id: ReferenceId) -> Result<Reference, PipelineError> {
         self.write(move |service| service.delete_now(id)).await
     }
 
     /// Deletes a map with everything in it; returns how many references that were.
+    ///
+    /// # Errors
+    /// There is no such map, or the store fails.
     pub async fn delete_map(self: &Arc<Self>, name: MapName) -> Result<u64, PipelineError> {
         self.write(move |service| service.delete_map_now(&name))
             .await
     }
 
-    /// Stores a map's calibration, or clears it: from the next query on it is in force.
+    /// Stores a map's calibration, or clears it. It is in force from the next query on.
+    ///
+    /// # Errors
+    /// There is no such map, the calibration was fitted for another model or another re-ranking, or
+    /// the store fails.
     pub async fn set_calibration(
         self: &Arc<Self>,
         name: MapName,
@@ -48,22 +58,18 @@ impl Service {
         id: ReferenceId,
         patch: ReferencePatch,
     ) -> Result<Reference, PipelineError> {
-        let moves = patch.location.is_some() || patch.captured_at.is_some();
+        let changes_index = patch.location.is_some() || patch.captured_at.is_some();
         let entry = self.maps.entry(&self.store.get(id)?.map);
-        let _changing = entry.changing();
+        let _changing = entry.lock_for_change();
         let reference = self.store.update(id, patch)?;
-        if moves {
-            let ReferenceFields {
-                location,
-                captured_at,
-                ..
-            } = reference.fields;
-            let change = || Change::Moved(id, location, captured_at);
-            entry
-                .live()
-                .iter()
-                .for_each(|live| change().apply(&live.index));
-            entry.note(change());
+        if changes_index {
+            let location = reference.fields.location;
+            let captured_at = reference.fields.captured_at;
+            let change = Change::Moved(id, location, captured_at);
+            if let Some(live) = entry.live() {
+                change.apply(&live.index);
+            }
+            entry.note(change);
         }
         Ok(reference)
     }
@@ -71,12 +77,13 @@ impl Service {
     fn delete_now(&self, id: ReferenceId) -> Result<Reference, PipelineError> {
         let found = self.store.get(id);
         if let Err(StoreError::CorruptRecord { .. }) = found {
-            // It cannot say which map it is of; following the damage takes it out of the index.
+            // A damaged record cannot say which map it is of, so no map can be locked; following
+            // the damage takes the reference out of every index instead.
             self.follow_damage();
             return Ok(self.store.delete(id)?);
         }
         let entry = self.maps.entry(&found?.map);
-        let _changing = entry.changing();
+        let _changing = entry.lock_for_change();
         let reference = self.store.delete(id)?;
         if let Some(live) = entry.live() {
             live.index.remove(id);
@@ -87,13 +94,13 @@ impl Service {
     }
 
     fn delete_map_now(&self, name: &MapName) -> Result<u64, PipelineError> {
-        // One that cannot be served because its own record is damaged can still be deleted.
+        // A map that is not served because its own record is damaged can still be deleted.
         let damaged = || matches!(self.store.map(name), Err(StoreError::CorruptMap { .. }));
         if self.maps.live(name).is_none() && !damaged() {
             return Err(PipelineError::MapNotFound(name.clone()));
         }
         let entry = self.maps.entry(name);
-        let _changing = entry.changing();
+        let _changing = entry.lock_for_change();
         let deleted = self.store.delete_map(name)?;
         entry.clear();
         Ok(deleted)
@@ -105,10 +112,10 @@ impl Service {
         calibration: Option<Calibration>,
     ) -> Result<(), PipelineError> {
         let (entry, _) = self.existing(name)?;
-        let _changing = entry.changing();
-        calibration
-            .iter()
-            .try_for_each(|calibration| self.trust.check(name, calibration))?;
+        let _changing = entry.lock_for_change();
+        if let Some(calibration) = &calibration {
+            self.calibrations.check(name, calibration)?;
+        }
         self.store.set_calibration(name, calibration.clone())?;
         if let Some(live) = entry.live() {
             live.calibrate(calibration);
@@ -116,14 +123,14 @@ impl Service {
         Ok(())
     }
 
-    /// Changes the store in turn with others.
+    /// Changes the store, on no more threads at once than `store_writes` of the settings.
     ///
     /// Cancel safety: dropped while waiting, nothing is written; dropped later, the write runs to
     /// its end, because store and index change together.
-    pub(super) async fn write<T: Send + 'static>(
+    async fn write<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&Self) -> Result<T, PipelineError> + Send + 'static,
     ) -> Result<T, PipelineError> {
-        self.in_turn(&self.store_writes, work).await
+        self.run_limited(&self.store_writes, work).await
     }
 }

@@ -1,40 +1,44 @@
-//! Settings of the composition.
+//! Settings of the pipeline.
 
 use placeformer_core::types::InvalidValue;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
-/// Bounds and defaults that belong to no single stage.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// Bounds and defaults that belong to no single stage. The comments of the fields are printed as
+/// the manual of the configuration file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PipelineConfig {
-    /// Queries, and beside them references, that may wait for or be in compute; one more is told to
-    /// come back later.
+    /// Queries that may wait for the model or be computed at once; as many new references may,
+    /// besides. Beyond, a request is answered 503 overloaded.
     pub queue_capacity: usize,
-    /// Longest time a query may wait for its turn, in milliseconds; one that would wait longer is
-    /// told at once.
+    /// Longest time in milliseconds that a query may wait for the model. One that would wait longer
+    /// is answered 503 overloaded at once.
     pub max_wait_ms: u64,
-    /// Listings and look-ups that read the store at once. At least two fewer than `store.readers`,
-    /// so that queries always find a connection; one that gets no turn within `max_wait_ms` is told
-    /// to come back later.
+    /// Listings and look-ups that read the store at once. It is at least two fewer than
+    /// store.readers, so that queries and changes always find a connection. One that has to wait
+    /// longer than max_wait_ms is answered 503 overloaded.
     pub store_reads: usize,
-    /// Changes and deletions under way at once, with the same wait.
+    /// Changes and deletions under way at once, with the same longest wait.
     pub store_writes: usize,
     /// Bytes of key patches kept in memory for the next query.
     pub patch_cache_bytes: u64,
-    /// Results of a query that does not say.
+    /// Results of a query that does not say how many it wants.
     pub top_k: usize,
-    /// Candidates re-ranked for a query that does not say (paper: 100).
+    /// Candidates re-ranked for a query that does not say how many (the paper's number is 100).
     pub candidates: usize,
     /// Most results or candidates a query may ask for.
     pub max_candidates: usize,
-    /// Time allowed for a query that does not say, and the most it may ask for, in milliseconds.
+    /// Time in milliseconds for a query that does not say how much it has, and the most it may ask
+    /// for.
     pub deadline_ms: u64,
-    /// Part of a query's time kept back for writing the answer, in milliseconds.
+    /// Part of a query's time in milliseconds kept back for writing the answer.
     pub answer_reserve_ms: u64,
-    /// Resident bytes above which nothing new is taken in; 0 means 85% of what the process may use.
+    /// Resident bytes of the process above which nothing new is taken in; 0 means 85% of what the
+    /// process may use.
     pub memory_watermark_bytes: u64,
-    /// Free bytes on the store's disk below which nothing new is taken in (a twentieth of a small
-    /// disk).
+    /// Free bytes on the store's disk below which nothing new is taken in, so that deletions have
+    /// room. Whatever is set, it is at most a twentieth of the disk.
     pub disk_reserve_bytes: u64,
     /// Longest metadata of a reference in bytes of JSON.
     pub max_metadata_bytes: usize,
@@ -61,7 +65,10 @@ impl Default for PipelineConfig {
 }
 
 impl PipelineConfig {
-    /// Checks what the types cannot.
+    /// Checks the rules that the types cannot express.
+    ///
+    /// # Errors
+    /// A value is out of range.
     pub fn check(&self) -> Result<(), InvalidValue> {
         let positive = [
             ("pipeline.queue_capacity", self.queue_capacity as u64),
@@ -81,21 +88,22 @@ impl PipelineConfig {
                 "it is below the default top_k or candidates",
             ));
         }
-        let places = [
+        let semaphores = [
             ("pipeline.queue_capacity", self.queue_capacity),
             ("pipeline.store_reads", self.store_reads),
             ("pipeline.store_writes", self.store_writes),
         ];
-        if let Some((field, _)) = places
-            .iter()
-            .find(|(_, places)| *places > tokio::sync::Semaphore::MAX_PERMITS)
-        {
+        let most = tokio::sync::Semaphore::MAX_PERMITS;
+        if let Some((field, _)) = semaphores.iter().find(|(_, permits)| *permits > most) {
             return Err(InvalidValue::new(field, "it is too large"));
         }
         Ok(())
     }
 
     /// Checks a number of results or candidates that a query asks for.
+    ///
+    /// # Errors
+    /// It is 0 or above the bound.
     pub fn check_count(&self, field: &'static str, count: usize) -> Result<usize, InvalidValue> {
         if (1..=self.max_candidates).contains(&count) {
             Ok(count)

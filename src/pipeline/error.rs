@@ -13,7 +13,7 @@ pub enum PipelineError {
     /// The image was refused.
     #[error(transparent)]
     Image(#[from] ImageError),
-    /// The decoder itself broke on this image; the process goes on.
+    /// The decoder panicked on this image; the process goes on.
     #[error("the decoder failed on this image")]
     DecoderPanicked,
     /// The model failed.
@@ -41,7 +41,7 @@ pub enum PipelineError {
     /// What was sent is not a head.
     #[error("what was sent is not a head")]
     HeadUnreadable(#[source] ExtractError),
-    /// The map's pooled vectors, or this server's, cannot pass through the head.
+    /// The map's pooled vectors, or this server's, cannot be projected with the head.
     #[error("map {map} cannot take this head")]
     HeadMismatch {
         /// The map.
@@ -49,9 +49,10 @@ pub enum PipelineError {
         /// Why not.
         source: ExtractError,
     },
-    /// The calibration was fitted on scores of another re-ranking.
+    /// The calibration was fitted on scores of another re-ranking than this server's.
     #[error(
-        "the calibration for map {map} was fitted for re-ranking \"{given}\", this server's is \"{server}\""
+        "the calibration for map {map} was fitted for re-ranking \"{given}\", this server's is \
+         \"{server}\""
     )]
     RerankMismatch {
         /// The map.
@@ -69,7 +70,7 @@ pub enum PipelineError {
         /// The id.
         external_id: ExternalId,
     },
-    /// The queue is full, or too long to wait in.
+    /// The queue is full, or the request would have to wait in it for too long.
     #[error(
         "{waiting} requests are waiting or being computed, more than can be answered soon enough"
     )]
@@ -79,8 +80,8 @@ pub enum PipelineError {
         /// When a place is likely to be free.
         retry_after: Duration,
     },
-    /// Too many others read or change the store.
-    #[error("the store is busy with other requests, and no turn came soon enough")]
+    /// Too many other requests read or change the store.
+    #[error("the store is busy with other requests, and none of them ended soon enough")]
     StoreBusy,
     /// Resident memory is above the watermark.
     #[error(transparent)]
@@ -97,7 +98,7 @@ pub enum PipelineError {
     /// The server is stopping.
     #[error("the server is stopping")]
     ShuttingDown,
-    /// A stage broke; the process goes on.
+    /// A stage panicked; the process goes on.
     #[error("{stage} failed unexpectedly")]
     Panicked {
         /// Which stage.

@@ -1,14 +1,15 @@
-//! Bytes to a descriptor: decoding beside, extraction behind the one compute worker.
+//! From the bytes of an image to its descriptor: decoding on a few threads, extraction on one
+//! compute worker.
 //!
-//! Blocking work cannot be stopped once it has begun, but whoever waits for it may leave at any
-//! moment. So every permit, lock and ticket that bounds such work moves into it and is given back
-//! when the work itself ends: clients that hang up and come again get no more threads than clients
-//! that stay.
+//! Blocking work cannot be stopped once it has begun, but the request that waits for it may go away
+//! at any moment. So every permit, lock and ticket that bounds such work moves into it and is given
+//! back when the work itself ends: clients that hang up and come again get no more threads than
+//! clients that stay.
 
 use super::admission::Ticket;
 use super::blocking::{Panicked, blocking};
 use super::{DescriptorSource, PipelineError, Timings};
-use crate::ops::{Metrics, Stage};
+use crate::ops::{Metrics, PipelineStage};
 use bytes::Bytes;
 use placeformer_core::types::{Deadline, Descriptor, ImageTensor};
 use placeformer_vision::image::ImageConfig;
@@ -17,6 +18,9 @@ use std::sync::Arc;
 use std::time::Instant;
 use tokio::sync::{Mutex, OwnedMutexGuard, Semaphore};
 use tokio::time::timeout;
+
+/// What errors call the computation of a descriptor.
+const EXTRACTION: &str = "extraction";
 
 /// What a descriptor is for.
 #[derive(Debug, Clone, Copy)]
@@ -27,28 +31,30 @@ pub(super) enum Purpose {
     Ingest,
 }
 
+/// The model behind its bounds.
 pub(super) struct Extraction {
     source: Arc<dyn DescriptorSource>,
     image: Arc<ImageConfig>,
-    /// Decoders at work: one per core, so that a burst does not starve the model.
+    /// Decoders at work: one per core, so that a burst of images does not starve the model.
     decoders: Arc<Semaphore>,
-    /// First come, first served; a waiter that is dropped leaves the line.
+    /// The one compute worker. The first to wait is the first to be served, and a request that is
+    /// dropped while it waits leaves the queue.
     worker: Arc<Mutex<()>>,
-    /// Held by the one reference that stands in that line; the others wait here, so that a query
-    /// never waits for more than one of them.
+    /// Locked by the one reference that waits for the worker; the others wait for this lock, so
+    /// that a query never waits for more than one of them.
     ingest: Arc<Mutex<()>>,
     metrics: Arc<Metrics>,
 }
 
-/// The right to compute; given back when dropped.
-struct Turn {
+/// The right to use the compute worker; given back when dropped.
+struct WorkerPermit {
     _worker: OwnedMutexGuard<()>,
     _ingest: Option<OwnedMutexGuard<()>>,
 }
 
 impl Purpose {
     /// Fails once the deadline has passed, naming the stage that it kept from running.
-    pub(super) fn not_passed(self, stage: &'static str) -> Result<(), PipelineError> {
+    pub(super) fn check_deadline(self, stage: &'static str) -> Result<(), PipelineError> {
         match self {
             Self::Answer(deadline) if deadline.has_passed() => {
                 Err(PipelineError::DeadlineExceeded { stage })
@@ -59,8 +65,8 @@ impl Purpose {
 
     /// Waits for `work` until the deadline.
     ///
-    /// Cancel safety: as `work`, which is dropped when the deadline passes.
-    async fn in_time<T>(
+    /// Cancel safety: that of `work`, which is dropped when the deadline passes.
+    async fn within_deadline<T>(
         self,
         stage: &'static str,
         work: impl Future<Output = T>,
@@ -95,7 +101,7 @@ impl Extraction {
         &self.source
     }
 
-    /// What the model sees in `bytes`. `ticket` is kept until the last work for it has ended.
+    /// The descriptor of the image in `bytes`. `ticket` is kept until the last work for it ends.
     ///
     /// Cancel safety: dropped while waiting, nothing is computed; dropped later, what is being
     /// computed is finished under the bounds it began with, and its outcome is lost.
@@ -107,37 +113,21 @@ impl Extraction {
         timings: &mut Timings,
     ) -> Result<Descriptor, PipelineError> {
         let tensor = self.decode(bytes, purpose, ticket, timings).await?;
+
         let waiting_since = Instant::now();
-        let turn = purpose.in_time("extraction", self.turn(purpose)).await?;
-        timings.record(&self.metrics, Stage::Queue, waiting_since.elapsed());
-        purpose.not_passed("extraction")?;
-        let (source, ticket, started) = (self.source.clone(), ticket.clone(), Instant::now());
-        let described = blocking(move || {
-            let described = source.describe(&[tensor]);
-            drop((turn, ticket));
-            described
-        });
-        let described = purpose.in_time("extraction", described).await?;
-        timings.record(&self.metrics, Stage::Extract, started.elapsed());
-        let mut descriptors = described.map_err(|_| PipelineError::Panicked {
-            stage: "extraction",
-        })??;
-        descriptors.pop().ok_or(PipelineError::Panicked {
-            stage: "extraction",
-        })
+        let permit = self.worker_permit(purpose);
+        let permit = purpose.within_deadline(EXTRACTION, permit).await?;
+        timings.record(&self.metrics, PipelineStage::Queue, waiting_since.elapsed());
+        purpose.check_deadline(EXTRACTION)?;
+
+        let started = Instant::now();
+        let extracting = self.extract(tensor, permit, ticket.clone());
+        let extracted = purpose.within_deadline(EXTRACTION, extracting).await?;
+        timings.record(&self.metrics, PipelineStage::Extract, started.elapsed());
+        extracted
     }
 
-    async fn turn(&self, purpose: Purpose) -> Turn {
-        let ingest = match purpose {
-            Purpose::Ingest => Some(self.ingest.clone().lock_owned().await),
-            Purpose::Answer(_) => None,
-        };
-        Turn {
-            _worker: self.worker.clone().lock_owned().await,
-            _ingest: ingest,
-        }
-    }
-
+    /// Bytes to the tensor that the model sees.
     async fn decode(
         &self,
         bytes: Bytes,
@@ -145,40 +135,67 @@ impl Extraction {
         ticket: &Arc<Ticket>,
         timings: &mut Timings,
     ) -> Result<ImageTensor, PipelineError> {
-        let (source, config) = (self.source.clone(), self.image.clone());
-        let decoding = self.beside(ticket, move || {
+        let source = self.source.clone();
+        let config = self.image.clone();
+        let decoding = self.on_decoder_thread(ticket, move || {
             let started = Instant::now();
-            (source.decode(&bytes, &config), started.elapsed())
+            let decoded = source.decode(&bytes, &config);
+            (decoded, started.elapsed())
         });
-        let decoded = purpose.in_time("decoding", decoding).await??;
+        let decoded = purpose.within_deadline("decoding", decoding).await??;
         let (decoded, took) = decoded.map_err(|_| PipelineError::DecoderPanicked)?;
-        timings.record(&self.metrics, Stage::Decode, took);
+        timings.record(&self.metrics, PipelineStage::Decode, took);
         Ok(decoded?)
     }
 
-    /// Runs `work` on the bytes of an image, beside the model, on no more threads than there are
-    /// cores.
+    /// Waits for the compute worker; at most one reference waits for it among the queries.
+    async fn worker_permit(&self, purpose: Purpose) -> WorkerPermit {
+        let ingest = match purpose {
+            Purpose::Ingest => Some(self.ingest.clone().lock_owned().await),
+            Purpose::Answer(_) => None,
+        };
+        WorkerPermit {
+            _worker: self.worker.clone().lock_owned().await,
+            _ingest: ingest,
+        }
+    }
+
+    /// Tensor to descriptor, on the compute worker.
+    async fn extract(
+        &self,
+        tensor: ImageTensor,
+        permit: WorkerPermit,
+        ticket: Arc<Ticket>,
+    ) -> Result<Descriptor, PipelineError> {
+        let panicked = || PipelineError::Panicked { stage: EXTRACTION };
+        let source = self.source.clone();
+        let extracted = blocking(move || {
+            let extracted = source.describe(&[tensor]);
+            drop((permit, ticket));
+            extracted
+        });
+        let mut descriptors = extracted.await.map_err(|_| panicked())??;
+        descriptors.pop().ok_or_else(panicked)
+    }
+
+    /// Runs `work` on the bytes of an image, on no more threads at once than there are cores.
     ///
-    /// Cancel safety: dropped before the work began, it never begins; dropped later, it holds its
-    /// place and `ticket` until it ends.
-    pub(super) async fn beside<T: Send + 'static>(
+    /// Cancel safety: dropped before the work began, it never begins; dropped later, the work keeps
+    /// its thread and `ticket` until it ends.
+    pub(super) async fn on_decoder_thread<T: Send + 'static>(
         &self,
         ticket: &Arc<Ticket>,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<Result<T, Panicked>, PipelineError> {
+        let permit = self.decoders.clone().acquire_owned().await;
         // The semaphore is never closed.
-        let place = self
-            .decoders
-            .clone()
-            .acquire_owned()
-            .await
-            .map_err(|_| PipelineError::ShuttingDown)?;
+        let permit = permit.map_err(|_| PipelineError::ShuttingDown)?;
         let ticket = ticket.clone();
-        Ok(blocking(move || {
-            let done = work();
-            drop((place, ticket));
-            done
-        })
-        .await)
+        let outcome = blocking(move || {
+            let outcome = work();
+            drop((permit, ticket));
+            outcome
+        });
+        Ok(outcome.await)
     }
 }

@@ -1,22 +1,20 @@
-//! Image and metadata to a durable, searchable reference.
+//! From an image and its metadata to a durable, searchable reference.
 
 use super::admission::Ticket;
 use super::blocking::blocking;
 use super::extraction::Purpose;
 use super::{PipelineError, Service, Timings};
-use crate::ops::Stage;
+use crate::ops::PipelineStage;
 use crate::ops::metrics::Rejection;
 use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
-use placeformer_core::types::{
-    ContentHash, InvalidValue, MapName, NewReference, Reference, ReferenceFields,
-};
+use placeformer_core::types::{ContentHash, MapName, NewReference, Reference, ReferenceFields};
 use placeformer_store::Inserted;
 use placeformer_vision::search::IndexEntry;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// A reference to be taken in.
+/// A reference to be stored.
 #[derive(Debug, Clone)]
 pub struct IngestRequest {
     /// Its map; created on first use.
@@ -39,30 +37,36 @@ pub struct IngestAnswer {
 }
 
 impl Service {
-    /// Takes in one reference; returns once it is fsynced and in the index.
+    /// Stores one reference; returns once it is fsynced and in the index.
     ///
     /// Cancel safety: dropped before the commit began, nothing is stored; dropped later, the
     /// reference is stored and indexed all the same, and repeating the request with its external id
     /// finds it.
+    ///
+    /// # Errors
+    /// Disk, memory or queue are full; the image, the metadata or the map's model do not fit; the
+    /// external id names another image; the store fails.
     pub async fn ingest(
         self: &Arc<Self>,
         request: IngestRequest,
     ) -> Result<IngestAnswer, PipelineError> {
         self.may_store()?;
-        self.check_metadata(&request.fields)?;
+        self.check_metadata(request.fields.metadata.as_ref())?;
         let model = self.extraction.source().model_id().clone();
         if let Some(live) = self.maps.live(&request.map) {
             live.check_model(&request.map, &model)?;
         }
-        let ticket = Arc::new(self.references.enter(Duration::MAX)?);
+        let ticket = Arc::new(self.references.admit(Duration::MAX)?);
+
         let content_hash = self.hash(request.image.clone(), &ticket).await?;
-        if let Some(reference) = self.known(&request, content_hash).await? {
+        if let Some(reference) = self.already_stored(&request, content_hash).await? {
             return Ok(IngestAnswer {
                 reference,
                 created: false,
                 timings: Timings::default(),
             });
         }
+
         let mut timings = Timings::default();
         let descriptor = self
             .extraction
@@ -75,16 +79,10 @@ impl Service {
             model,
             descriptor,
         };
-        let (service, started) = (self.clone(), Instant::now());
-        let committed = blocking(move || {
-            let committed = service.commit(new);
-            drop(ticket);
-            committed
-        })
-        .await;
-        timings.record(&self.metrics, Stage::Commit, started.elapsed());
-        let inserted = committed.map_err(|_| PipelineError::Panicked { stage: "the store" })??;
-        let (reference, created) = match inserted {
+        let started = Instant::now();
+        let committed = self.commit(new, ticket).await;
+        timings.record(&self.metrics, PipelineStage::Commit, started.elapsed());
+        let (reference, created) = match committed? {
             Inserted::Created(reference) => (reference, true),
             Inserted::AlreadyThere(reference) => (reference, false),
         };
@@ -95,43 +93,19 @@ impl Service {
         })
     }
 
-    /// Refuses while disk or memory is short. Deleting is never refused.
-    pub fn may_store(&self) -> Result<(), PipelineError> {
-        if self.health.is_disk_full() {
-            self.metrics.rejected(Rejection::DiskFull);
-            return Err(PipelineError::DiskFull);
-        }
-        self.memory
-            .check()
-            .inspect_err(|_| self.metrics.rejected(Rejection::MemoryPressure))?;
-        Ok(())
-    }
-
-    /// Bounds the metadata of a reference.
-    pub(super) fn check_metadata(&self, fields: &ReferenceFields) -> Result<(), PipelineError> {
-        let Some(metadata) = &fields.metadata else {
-            return Ok(());
-        };
-        let length = serde_json::to_vec(metadata).map_or(usize::MAX, |text| text.len());
-        let bound = self.config.max_metadata_bytes;
-        if length > bound {
-            let reason = format!("{length} bytes of JSON are more than the {bound} allowed");
-            return Err(InvalidValue::new("metadata", reason).into());
-        }
-        Ok(())
-    }
-
     async fn hash(&self, image: Bytes, ticket: &Arc<Ticket>) -> Result<ContentHash, PipelineError> {
         let hashed = self
             .extraction
-            .beside(ticket, move || ContentHash::of(&image))
+            .on_decoder_thread(ticket, move || ContentHash::of(&image))
             .await?;
         hashed.map_err(|_| PipelineError::Panicked { stage: "hashing" })
     }
 
-    /// The reference that this request repeats, found before anything costly; a conflict if it is
-    /// another image.
-    async fn known(
+    /// The reference that this request repeats, found before anything costly is done.
+    ///
+    /// # Errors
+    /// The external id names another image, or the store fails.
+    async fn already_stored(
         self: &Arc<Self>,
         request: &IngestRequest,
         content_hash: ContentHash,
@@ -139,57 +113,65 @@ impl Service {
         let Some(external_id) = request.fields.external_id.clone() else {
             return Ok(None);
         };
-        match self
-            .find_external(request.map.clone(), external_id.clone())
-            .await
-        {
+        let map = request.map.clone();
+        match self.find_external(map.clone(), external_id.clone()).await {
             Ok(Some(reference)) if reference.content_hash == content_hash => Ok(Some(reference)),
-            Ok(Some(_)) => Err(PipelineError::ExternalIdConflict {
-                map: request.map.clone(),
-                external_id,
-            }),
+            Ok(Some(_)) => Err(PipelineError::ExternalIdConflict { map, external_id }),
             Ok(None) => Ok(None),
-            // The map is made by this very request; or the record is damaged, and this image may
-            // replace it.
-            Err(error)
-                if matches!(
-                    error.code(),
-                    ErrorCode::MapNotFound | ErrorCode::CorruptRecord
-                ) =>
-            {
-                Ok(None)
-            }
-            Err(error) => Err(error),
+            Err(error) => match error.code() {
+                // The map does not exist yet: this request creates it.
+                ErrorCode::MapNotFound => Ok(None),
+                // The stored record is damaged: this image may replace it.
+                ErrorCode::CorruptRecord => Ok(None),
+                _ => Err(error),
+            },
         }
     }
 
-    fn commit(&self, mut new: NewReference) -> Result<Inserted, PipelineError> {
+    /// Writes the reference to the store and to the index on a blocking thread.
+    async fn commit(
+        self: &Arc<Self>,
+        new: NewReference,
+        ticket: Arc<Ticket>,
+    ) -> Result<Inserted, PipelineError> {
+        let service = self.clone();
+        let committed = blocking(move || {
+            let committed = service.commit_now(new);
+            drop(ticket);
+            committed
+        });
+        let panicked = |_| PipelineError::Panicked { stage: "the store" };
+        committed.await.map_err(panicked)?
+    }
+
+    fn commit_now(&self, mut new: NewReference) -> Result<Inserted, PipelineError> {
         let entry = self.maps.entry(&new.map);
-        let _inserting = entry.inserting();
-        // The map may have been given another head since the request was let in.
+        let _inserting = entry.lock_for_insert();
+        // The map may have been given another head since the request was admitted.
         if let Some(live) = entry.live() {
             live.check_model(&new.map, &new.model)?;
             new.descriptor.global = live.global_of(&new.descriptor).into_owned();
             new.model = live.model.clone();
         }
         let model = new.model.clone();
-        let (global, patch_bytes) = (
-            new.descriptor.global.clone(),
-            new.descriptor.patches.heap_bytes(),
-        );
+        let global = new.descriptor.global.clone();
+        let patch_bytes = new.descriptor.patches.heap_bytes();
+
         let inserted = self.store.insert(new).inspect_err(|error| {
             if error.code() == ErrorCode::DiskFull {
                 self.health.set_disk_full(true);
                 self.metrics.rejected(Rejection::DiskFull);
             }
         });
-        // A damaged reference that this one replaces leaves the index before anyone may miss it in
-        // the store.
+        // If the new reference replaces a damaged one, that one leaves the index before the map's
+        // entry is unlocked. A query that found it in the index but not in the store would report
+        // it as lost.
         self.follow_damage();
         let inserted = inserted?;
+
         if let Inserted::Created(reference) = &inserted {
-            self.metrics
-                .stored_descriptor(global.len() * size_of::<f32>(), patch_bytes);
+            let global_bytes = global.len() * size_of::<f32>();
+            self.metrics.stored_descriptor(global_bytes, patch_bytes);
             entry.live_or_create(&model).index.insert(IndexEntry {
                 id: reference.id,
                 global,

@@ -1,14 +1,17 @@
 //! The maps that can be searched, each with its index.
 //!
-//! A map's entry outlives the map: deleting empties it, the next insert fills it again, so that
-//! whoever waits for its lock meanwhile never writes into an orphan. Inserts share the lock,
-//! deletions and changes take it alone; both hold it over commit and index together, so the index
-//! never keeps what the store has lost. While another head is prepared for a map, what changes
-//! meanwhile is noted, so that the new index can catch up.
+//! A map's entry outlives the map: deleting the map empties the entry, and the next insert fills it
+//! again. So a request that waits for the entry's lock while the map is deleted never writes into
+//! an index that nobody searches.
+//!
+//! Inserts share that lock, deletions and changes lock it alone. Both keep it locked over the
+//! commit in the store and the change of the index, so the index never keeps what the store has
+//! lost. While another head is prepared for a map, the changes made meanwhile are noted in a
+//! journal, from which the new index catches up.
 
 use super::PipelineError;
 use placeformer_core::types::{Calibration, Descriptor, GeoPoint, MapName, ModelId, ReferenceId};
-use placeformer_store::StoreError;
+use placeformer_store::{GlobalRow, StoreError};
 use placeformer_vision::extract::Head;
 use placeformer_vision::search::{IndexEntry, MapIndex};
 use std::borrow::Cow;
@@ -16,21 +19,26 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use time::OffsetDateTime;
 
+/// All maps by name.
 #[derive(Default)]
 pub(super) struct Maps(RwLock<HashMap<MapName, Arc<MapEntry>>>);
 
 /// One name, whether or not the map exists right now.
 #[derive(Default)]
 pub(super) struct MapEntry {
+    /// Locked over a commit in the store and the change of the index that belongs to it.
     writes: RwLock<()>,
     live: RwLock<Option<Arc<LiveMap>>>,
-    /// Changes since another head began to be prepared; none while that is not so.
+    /// Changes made since another head began to be prepared; `None` while no head is prepared.
     journal: Mutex<Option<Vec<Change>>>,
 }
 
-/// A change of what an index holds.
+/// A change of an entry of an index.
+#[derive(Debug, Clone, Copy)]
 pub(super) enum Change {
+    /// Another location or capture time.
     Moved(ReferenceId, Option<GeoPoint>, Option<OffsetDateTime>),
+    /// No longer there.
     Deleted(ReferenceId),
 }
 
@@ -42,7 +50,7 @@ pub(super) enum Projection {
     Own(Arc<Head>),
     /// Not by this server.
     Foreign,
-    /// By a head that was lost to the disk.
+    /// By a head of which the store has only damaged bytes.
     Lost,
 }
 
@@ -65,7 +73,8 @@ impl Maps {
         read(&self.0).get(name).cloned()
     }
 
-    /// The map, which must exist and be comparable with what a server of `model` sees.
+    /// The map, which must exist and have descriptors comparable with those of a server that runs
+    /// `model`.
     pub(super) fn comparable(
         &self,
         name: &MapName,
@@ -101,40 +110,40 @@ impl Maps {
 }
 
 impl MapEntry {
+    /// The map, if it exists now.
     pub(super) fn live(&self) -> Option<Arc<LiveMap>> {
         read(&self.live).clone()
     }
 
-    /// Held by an insert over its commit and its entry into the index.
-    pub(super) fn inserting(&self) -> RwLockReadGuard<'_, ()> {
+    /// The lock of an insert, shared with others, to be kept from before the commit until the
+    /// reference is in the index.
+    pub(super) fn lock_for_insert(&self) -> RwLockReadGuard<'_, ()> {
         read(&self.writes)
     }
 
-    /// Held by a deletion or change over store and index.
-    pub(super) fn changing(&self) -> RwLockWriteGuard<'_, ()> {
+    /// The lock of a deletion or change, shared with nobody, to be kept over store and index.
+    pub(super) fn lock_for_change(&self) -> RwLockWriteGuard<'_, ()> {
         write(&self.writes)
     }
 
-    /// The map, brought to life with the server's `model` if it was not.
+    /// The map, created empty with the server's `model` if it does not exist.
     pub(super) fn live_or_create(&self, model: &ModelId) -> Arc<LiveMap> {
         if let Some(live) = self.live() {
             return live;
         }
-        let fresh = || {
-            Arc::new(LiveMap::new(
-                model.clone(),
-                Projection::Server,
-                MapIndex::default(),
-                None,
-            ))
+        let empty = || {
+            let index = MapIndex::default();
+            Arc::new(LiveMap::new(model.clone(), Projection::Server, index, None))
         };
-        write(&self.live).get_or_insert_with(fresh).clone()
+        write(&self.live).get_or_insert_with(empty).clone()
     }
 
+    /// Puts `live` in the place of what was there.
     pub(super) fn put(&self, live: LiveMap) -> Arc<LiveMap> {
         write(&self.live).insert(Arc::new(live)).clone()
     }
 
+    /// The map exists no longer.
     pub(super) fn clear(&self) {
         *write(&self.live) = None;
     }
@@ -147,8 +156,9 @@ impl MapEntry {
         begins
     }
 
-    /// Notes a change, if anyone wants to know: before the index in force is changed, or while
-    /// [`MapEntry::changing`] is held.
+    /// Notes a change in the journal, if one is kept. To be called before the index in force is
+    /// changed, or with [`MapEntry::lock_for_change`] locked; otherwise an index that replaces the
+    /// one in force between the two would miss the change.
     pub(super) fn note(&self, change: Change) {
         if let Some(journal) = lock(&self.journal).as_mut() {
             journal.push(change);
@@ -162,12 +172,13 @@ impl MapEntry {
 }
 
 impl Change {
+    /// Makes the change in `index`.
     pub(super) fn apply(self, index: &MapIndex) {
         match self {
             Self::Deleted(id) => {
                 index.remove(id);
             }
-            // Only what is in the index moves; a damaged reference is not.
+            // A damaged reference is not in the index and does not enter it by being moved.
             Self::Moved(id, location, captured_at) => {
                 if let Some(global) = index.global(id) {
                     index.insert(IndexEntry {
@@ -197,7 +208,7 @@ impl LiveMap {
         }
     }
 
-    /// The global descriptor, comparable with this map's, of what the server saw.
+    /// The global descriptor by which this map is searched, from a descriptor that the server made.
     pub(super) fn global_of<'d>(&self, descriptor: &'d Descriptor) -> Cow<'d, [f32]> {
         match &self.projection {
             Projection::Own(head) => Cow::Owned(head.project(&descriptor.pooled)),
@@ -212,11 +223,13 @@ impl LiveMap {
         read(&self.calibration).clone()
     }
 
+    /// Replaces the calibration, from the next query on.
     pub(super) fn calibrate(&self, calibration: Option<Calibration>) {
         *write(&self.calibration) = calibration.map(Arc::new);
     }
 
-    /// Refuses a map that what this server, which runs `model`, sees cannot be compared with.
+    /// Refuses a map whose descriptors cannot be compared with those of this server, which runs
+    /// `model`.
     pub(super) fn check_model(&self, name: &MapName, model: &ModelId) -> Result<(), PipelineError> {
         match self.projection {
             Projection::Server | Projection::Own(_) => Ok(()),
@@ -230,12 +243,29 @@ impl LiveMap {
     }
 }
 
+/// A reference of the store as an entry of an index.
+pub(super) fn index_entry(row: GlobalRow) -> IndexEntry {
+    let GlobalRow {
+        reference,
+        global,
+        location,
+        captured_at,
+    } = row;
+    IndexEntry {
+        id: reference,
+        global,
+        location,
+        captured_at,
+    }
+}
+
+// A thread that panics with one of these locks leaves the value whole, because each value is
+// changed by one assignment or one call. So a poisoned lock can be used all the same.
+
 fn lock<T>(lock: &Mutex<T>) -> MutexGuard<'_, T> {
     lock.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-// No code panics while it holds one of these locks for writing, and the values stay whole if it
-// did.
 fn read<T>(lock: &RwLock<T>) -> RwLockReadGuard<'_, T> {
     lock.read().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,19 +1,29 @@
 //! The only code that composes the stages; knows nothing of the web.
 //!
-//! A [`Service`] holds the store, the in-memory index of every map, the model and the matcher.
-//! Three ways lead through it: [`Service::ingest`], [`Service::query`] and
-//! [`Service::match_images`]. Each takes a ticket at the door (a bounded queue: who finds it full
-//! is told so at once), decodes off the async threads, queues for the one compute worker, and
-//! finishes in a blocking task. A caller that goes away drops its future, and with it everything
-//! not yet begun; blocking work that has begun takes its ticket and its turn along and keeps them
-//! until it ends.
+//! A [`Service`] has the store, the in-memory index of every map, the model and the matcher. Three
+//! paths lead through it: [`Service::ingest`], [`Service::query`] and [`Service::match_images`].
+//! Each takes a place in a bounded queue, and is refused at once if the queue is full. It then
+//! decodes the image off the async threads, waits for the one compute worker, and finishes in a
+//! blocking task. A caller that goes away drops its future, and with it everything that has not
+//! begun; blocking work that has begun keeps its place in the queue and its permit until it ends.
 //!
-//! The store is the truth, the index a cache of it: a reference enters the index only after its
-//! commit and leaves it right after its deletion; the few queries between the two skip a candidate
-//! they no longer find.
+//! The store is the truth and the index is a cache of it. A reference enters the index only after
+//! its commit and leaves it right after its deletion. A query between the two finds a candidate in
+//! the index that is no longer in the store, and skips it.
+//!
+//! | module | what it does |
+//! |---|---|
+//! | `query`, `ingest`, `match_images` | the three paths, each in the order of its steps |
+//! | `changes`, `rehead` | changing and deleting references and maps; another head for a map |
+//! | `service`, `startup` | the state they share, and how it is built from the store |
+//! | `extraction` | decoding and the compute worker |
+//! | `admission`, `blocking` | bounds on waiting and on threads |
+//! | `maps`, `patches` | index and locks of each map; cache of key patches |
+//! | `calibrations` | how far the best answer can be trusted |
 
 mod admission;
 mod blocking;
+mod calibrations;
 mod changes;
 mod config;
 mod error;
@@ -28,15 +38,14 @@ mod service;
 mod source;
 mod startup;
 mod timings;
-mod trust;
 
+pub use calibrations::MatchConfidence;
 pub use config::PipelineConfig;
 pub use error::PipelineError;
 pub use ingest::{IngestAnswer, IngestRequest};
-pub use match_images::{MatchAnswer, MatchSide, Matched};
+pub use match_images::{MatchAnswer, MatchTarget, MatchedPair};
 pub use query::{QueryAnswer, QueryOptions, QueryRequest, QueryResult};
 pub use service::{Service, ServiceInfo};
 pub use source::DescriptorSource;
 pub use startup::Parts;
 pub use timings::Timings;
-pub use trust::Verdict;

@@ -6,14 +6,16 @@ use placeformer_store::{PlaceStore, StoreError};
 use quick_cache::sync::Cache;
 use std::sync::Arc;
 
-/// Typical size of a reference's patches, to size the cache's table.
+/// Typical size in bytes of a reference's key patches, to size the cache's table.
 const TYPICAL_BYTES: u64 = 120 << 10;
 
+/// Key patches of the references that were candidates lately.
 pub(super) struct PatchCache {
     cache: Cache<ReferenceId, Arc<PackedPatches>, ByBytes>,
     metrics: Arc<Metrics>,
 }
 
+/// Weighs an entry by the memory it takes.
 #[derive(Clone)]
 struct ByBytes;
 
@@ -25,6 +27,7 @@ impl quick_cache::Weighter<ReferenceId, Arc<PackedPatches>> for ByBytes {
 }
 
 impl PatchCache {
+    /// A cache of at most `bytes`.
     pub(super) fn new(bytes: u64, metrics: Arc<Metrics>) -> Self {
         let items = (bytes / TYPICAL_BYTES).max(1) as usize;
         Self {
@@ -33,7 +36,7 @@ impl PatchCache {
         }
     }
 
-    /// From memory, else from the store.
+    /// The key patches of a reference, from memory or else from the store.
     pub(super) fn load(
         &self,
         store: &dyn PlaceStore,
@@ -49,10 +52,12 @@ impl PatchCache {
         Ok(patches)
     }
 
+    /// Drops what belongs to a deleted reference.
     pub(super) fn forget(&self, id: ReferenceId) {
         self.cache.remove(&id);
     }
 
+    /// Memory in use.
     pub(super) fn bytes(&self) -> u64 {
         self.cache.weight()
     }

@@ -1,12 +1,17 @@
-//! A photo to ranked places: global search, then re-ranking of the candidates (paper III-A, III-D,
-//! III-E).
+//! From a photo to ranked places, step by step as in the paper.
+//!
+//! 1. The model turns the photo into a global descriptor and key patches (paper III-A to III-C).
+//! 2. Global search: the nearest global descriptors of the map are the candidates (paper III-A).
+//! 3. Re-ranking: key patches of photo and candidates are matched, and a homography counts the
+//!    inliers (paper III-D, III-E). It is left out if the query asks so or has no time left.
+//! 4. The first results get their metadata from the store, and the best one its confidence.
 
 use super::blocking::blocking;
+use super::calibrations::BestAnswer;
 use super::extraction::Purpose;
 use super::maps::LiveMap;
-use super::{PipelineError, Service, Timings, Verdict};
-use crate::ops::Stage;
-use crate::ops::metrics::Rejection;
+use super::{MatchConfidence, PipelineError, Service, Timings};
+use crate::ops::PipelineStage;
 use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{
@@ -65,20 +70,31 @@ pub struct QueryAnswer {
     /// Whether the order comes from re-ranking.
     pub reranked: bool,
     /// How far the first result can be trusted.
-    pub verdict: Verdict,
+    pub confidence: MatchConfidence,
     /// Where the time went.
     pub timings: Timings,
     /// What computed it.
     pub model: ModelId,
 }
 
-/// A candidate on its way to becoming a result.
-struct Placed {
+/// A reference in the ranking, not yet looked up in the store.
+struct RankedNeighbour {
     neighbour: Neighbour,
+    /// Outcome of re-ranking; absent if this one was not re-ranked.
     score: Option<PairScore>,
 }
 
-struct Plan {
+impl RankedNeighbour {
+    fn by_distance(&neighbour: &Neighbour) -> Self {
+        Self {
+            neighbour,
+            score: None,
+        }
+    }
+}
+
+/// A query with all its defaults filled in and its map found.
+struct QueryPlan {
     name: MapName,
     map: Arc<LiveMap>,
     top_k: usize,
@@ -93,145 +109,182 @@ impl Service {
     ///
     /// Cancel safety: dropped while waiting, nothing further is computed; what is being computed is
     /// finished in its place in the queue.
+    ///
+    /// # Errors
+    /// There is no such map, or it has another model; an option is out of range; the image is
+    /// refused; the queue is full or the time is up; the store fails.
     pub async fn query(
         self: &Arc<Self>,
         request: QueryRequest,
     ) -> Result<QueryAnswer, PipelineError> {
-        let outcome = self.answer(request).await;
+        let outcome = self.query_in_time(request).await;
         self.count_if_late(&outcome);
         outcome
     }
 
-    pub(super) fn count_if_late<T>(&self, outcome: &Result<T, PipelineError>) {
-        if let Err(PipelineError::DeadlineExceeded { .. }) = outcome {
-            self.metrics.rejected(Rejection::Deadline);
-        }
-    }
-
-    async fn answer(self: &Arc<Self>, request: QueryRequest) -> Result<QueryAnswer, PipelineError> {
-        let plan = match self.plan(&request.map, request.options) {
-            Err(PipelineError::MapNotFound(map)) => {
-                return self
-                    .in_turn(&self.store_reads, move |service| {
-                        Err(service.why_no_map(&map))
-                    })
-                    .await;
-            }
+    async fn query_in_time(
+        self: &Arc<Self>,
+        request: QueryRequest,
+    ) -> Result<QueryAnswer, PipelineError> {
+        let plan = match self.plan(request.map, request.options) {
+            Err(PipelineError::MapNotFound(map)) => return Err(self.explain_missing(map).await),
             plan => plan?,
         };
-        let patience = plan.deadline.remaining().min(self.patience());
         let purpose = Purpose::Answer(plan.deadline);
-        purpose.not_passed("decoding")?;
-        let ticket = Arc::new(self.queries.enter(patience)?);
+        purpose.check_deadline("decoding")?;
+        let max_wait = plan.deadline.remaining().min(self.max_wait());
+        let ticket = Arc::new(self.queries.admit(max_wait)?);
+
         let mut timings = Timings::default();
         let descriptor = self
             .extraction
             .describe(request.image, purpose, &ticket, &mut timings)
             .await?;
-        purpose.not_passed("search")?;
+        purpose.check_deadline("search")?;
+
         let service = self.clone();
-        let ranked = blocking(move || {
-            let ranked = service.rank(&plan, &descriptor, timings);
+        let answering = blocking(move || {
+            let answer = service.answer(&plan, &descriptor, timings);
             service.follow_damage();
             drop(ticket);
-            ranked
-        })
-        .await;
-        ranked.map_err(|_| PipelineError::Panicked { stage: "ranking" })?
+            answer
+        });
+        let panicked = |_| PipelineError::Panicked { stage: "ranking" };
+        answering.await.map_err(panicked)?
     }
 
-    fn plan(&self, map: &MapName, options: QueryOptions) -> Result<Plan, PipelineError> {
-        let top_k = self
-            .config
-            .check_count("top_k", options.top_k.unwrap_or(self.config.top_k))?;
-        let candidates = options.candidates.unwrap_or(self.config.candidates);
-        Ok(Plan {
-            name: map.clone(),
-            map: self
-                .maps
-                .comparable(map, self.extraction.source().model_id())?,
+    /// Fills in the defaults and finds the map.
+    fn plan(&self, name: MapName, options: QueryOptions) -> Result<QueryPlan, PipelineError> {
+        let config = &self.config;
+        let top_k = options.top_k.unwrap_or(config.top_k);
+        let top_k = config.check_count("top_k", top_k)?;
+        let candidates = options.candidates.unwrap_or(config.candidates);
+        let model = self.extraction.source().model_id();
+        let map = self.maps.comparable(&name, model)?;
+        let candidates = config.check_count("candidates", candidates)?;
+        let default_deadline = || Deadline::after(Duration::from_millis(config.deadline_ms));
+        Ok(QueryPlan {
+            name,
+            map,
             top_k,
-            candidates: self.config.check_count("candidates", candidates)?,
+            candidates,
             rerank: options.rerank.unwrap_or(true),
             filter: options.filter,
-            deadline: options
-                .deadline
-                .unwrap_or_else(|| Deadline::after(Duration::from_millis(self.config.deadline_ms))),
+            deadline: options.deadline.unwrap_or_else(default_deadline),
         })
     }
 
-    fn rank(
+    /// Asks the store why a map cannot be searched.
+    async fn explain_missing(self: &Arc<Self>, map: MapName) -> PipelineError {
+        let asking = self.run_limited(&self.store_reads, move |service| {
+            Ok(service.missing_map(&map))
+        });
+        asking.await.unwrap_or_else(|error| error)
+    }
+
+    /// Steps 2 to 4 of the query, on a blocking thread.
+    fn answer(
         &self,
-        plan: &Plan,
+        plan: &QueryPlan,
         query: &Descriptor,
         mut timings: Timings,
     ) -> Result<QueryAnswer, PipelineError> {
-        let started = Instant::now();
-        let fetched = if plan.rerank {
-            plan.candidates.max(plan.top_k)
-        } else {
-            plan.top_k
-        };
-        let neighbours = plan
-            .map
-            .index
-            .search(&plan.map.global_of(query), fetched, &plan.filter);
-        timings.record(&self.metrics, Stage::Search, started.elapsed());
-        let reranked = if plan.rerank {
-            self.rerank(plan, query, &neighbours, &mut timings)?
-        } else {
-            None
-        };
-        let was_reranked = reranked.is_some();
-        let placed = reranked.unwrap_or_else(|| {
-            neighbours
+        let neighbours = self.search(plan, query, &mut timings);
+        let reranking = self.rerank(plan, query, &neighbours, &mut timings)?;
+        let reranked = reranking.is_some();
+        let ranking = match reranking {
+            Some(ranking) => ranking,
+            None => neighbours
                 .iter()
-                .map(|&neighbour| Placed {
-                    neighbour,
-                    score: None,
-                })
-                .collect()
-        });
-        let results = self.with_metadata(plan, placed)?;
-        let best = results.first();
-        let verdict = self
-            .trust
-            .judge(&plan.map.model, plan.map.calibration().as_deref(), best);
-        let top1 = best
-            .and_then(|best| best.score.as_ref())
-            .map_or(0, |score| score.spatial_score);
-        self.metrics
-            .query_answered(was_reranked.then_some(top1), verdict.matched);
+                .map(RankedNeighbour::by_distance)
+                .collect(),
+        };
+
+        let results = self.with_metadata(plan, ranking)?;
+        let confidence = self.confidence(plan, results.first(), reranked);
         Ok(QueryAnswer {
             results,
-            reranked: was_reranked,
-            verdict,
+            reranked,
+            confidence,
             timings,
             model: plan.map.model.clone(),
         })
     }
 
-    /// The candidates in their new order, followed by the neighbours beyond them; `None` if time
-    /// ran out.
+    /// The references nearest to the query by global descriptor, nearest first.
+    fn search(
+        &self,
+        plan: &QueryPlan,
+        query: &Descriptor,
+        timings: &mut Timings,
+    ) -> Vec<Neighbour> {
+        let started = Instant::now();
+        let wanted = if plan.rerank {
+            plan.candidates.max(plan.top_k)
+        } else {
+            plan.top_k
+        };
+        let global = plan.map.global_of(query);
+        let neighbours = plan.map.index.search(&global, wanted, &plan.filter);
+        timings.record(&self.metrics, PipelineStage::Search, started.elapsed());
+        neighbours
+    }
+
+    /// The candidates ordered by spatial score, followed by the neighbours beyond them; `None` if
+    /// the query does not want it or time ran out.
     fn rerank(
         &self,
-        plan: &Plan,
+        plan: &QueryPlan,
         query: &Descriptor,
         neighbours: &[Neighbour],
         timings: &mut Timings,
-    ) -> Result<Option<Vec<Placed>>, PipelineError> {
+    ) -> Result<Option<Vec<RankedNeighbour>>, PipelineError> {
+        if !plan.rerank {
+            return Ok(None);
+        }
         let reserve = Duration::from_millis(self.config.answer_reserve_ms);
-        let Some(time_left) = plan
-            .deadline
-            .remaining()
-            .checked_sub(reserve)
-            .filter(|left| !left.is_zero())
-        else {
+        let time_left = plan.deadline.remaining().saturating_sub(reserve);
+        if time_left.is_zero() {
+            return Ok(None);
+        }
+
+        let (candidates, beyond) = neighbours.split_at(neighbours.len().min(plan.candidates));
+        let deadline = Deadline::after(time_left);
+        let outcome = self.score_candidates(query, candidates, deadline, timings);
+        let Reranked::Complete { ranked, failed } = outcome else {
             return Ok(None);
         };
-        let (candidates, beyond) = neighbours.split_at(neighbours.len().min(plan.candidates));
-        let (started, loading_ns) = (Instant::now(), AtomicU64::new(0));
-        // Loading runs on other threads, whose log lines belong to this request all the same.
+        for (i, error) in failed {
+            match error.code() {
+                // The candidate was deleted since the search, or it is damaged. The others are
+                // answered without it.
+                ErrorCode::ReferenceNotFound | ErrorCode::CorruptRecord => {
+                    self.withdraw(plan, candidates[i].id);
+                }
+                _ => return Err(error.into()),
+            }
+        }
+
+        let scored = ranked.into_iter().map(|ranked| RankedNeighbour {
+            neighbour: candidates[ranked.candidate],
+            score: Some(ranked.score),
+        });
+        let unscored = beyond.iter().map(RankedNeighbour::by_distance);
+        Ok(Some(scored.chain(unscored).collect()))
+    }
+
+    /// Matches the key patches of the query with those of each candidate, which are loaded from the
+    /// cache or the store on the way.
+    fn score_candidates(
+        &self,
+        query: &Descriptor,
+        candidates: &[Neighbour],
+        deadline: Deadline,
+        timings: &mut Timings,
+    ) -> Reranked<StoreError> {
+        let started = Instant::now();
+        let loading_ns = AtomicU64::new(0);
+        // Loading runs on other threads; their log lines belong to this request all the same.
         let span = tracing::Span::current();
         let load = |i: usize| {
             let begun = Instant::now();
@@ -239,98 +292,102 @@ impl Service {
             loading_ns.fetch_add(begun.elapsed().as_nanos() as u64, Ordering::Relaxed);
             loaded
         };
-        let outcome = self.reranker.rerank(
-            &query.patches,
-            candidates.len(),
-            load,
-            Some(Deadline::after(time_left)),
-        );
+        let count = candidates.len();
+        let outcome = self
+            .reranker
+            .rerank(&query.patches, count, load, Some(deadline));
         self.record_rerank(started.elapsed(), loading_ns.into_inner(), timings);
-        let Reranked::Complete { ranked, failed } = outcome else {
-            return Ok(None);
-        };
-        for (i, error) in failed {
-            match error.code() {
-                // Deleted since the search, or damaged: the others are answered.
-                ErrorCode::ReferenceNotFound | ErrorCode::CorruptRecord => {
-                    self.withdraw(plan, candidates[i].id)
-                }
-                _ => return Err(error.into()),
-            }
-        }
-        let scored = ranked.into_iter().map(|ranked| Placed {
-            neighbour: candidates[ranked.candidate],
-            score: Some(ranked.score),
-        });
-        let unscored = beyond.iter().map(|&neighbour| Placed {
-            neighbour,
-            score: None,
-        });
-        Ok(Some(scored.chain(unscored).collect()))
+        outcome
     }
 
-    /// Loading runs inside re-ranking, on all threads: its share of the wall time is its sum over
-    /// their number.
+    /// Splits the time of re-ranking into loading and matching. Loading runs within re-ranking on
+    /// all threads at once, so that its share of the `wall` time is its sum by their number.
     fn record_rerank(&self, wall: Duration, loading_ns: u64, timings: &mut Timings) {
-        let loading =
-            Duration::from_nanos(loading_ns / rayon::current_num_threads().max(1) as u64).min(wall);
-        timings.record(&self.metrics, Stage::Load, loading);
-        timings.record(&self.metrics, Stage::Rerank, wall - loading);
+        let threads = rayon::current_num_threads().max(1) as u64;
+        let loading = Duration::from_nanos(loading_ns / threads).min(wall);
+        timings.record(&self.metrics, PipelineStage::Load, loading);
+        timings.record(&self.metrics, PipelineStage::Rerank, wall - loading);
     }
 
-    /// What the store does not serve is not searched again. Nothing but a deletion, or sending the
-    /// image of a damaged one again, takes a reference out of the store; both take it out of the
-    /// index as well, so one that is in the index and unknown to the store while no change is under
-    /// way was lost.
-    fn withdraw(&self, plan: &Plan, id: ReferenceId) {
+    /// Takes a reference that the store did not return out of the map's index, so that it is not
+    /// found again, and reports it if it was lost.
+    ///
+    /// A reference leaves the store only by being deleted or, if it is damaged, by being replaced;
+    /// both take it out of the index, too, while they keep the map's entry locked. So a reference
+    /// that is still in the index while nobody else has that lock, but is unknown to the store, was
+    /// lost by the database.
+    fn withdraw(&self, plan: &QueryPlan, id: ReferenceId) {
         let entry = self.maps.entry(&plan.name);
-        let _settled = entry.changing();
-        let searched = plan.map.index.remove(id)
-            && entry
-                .live()
-                .is_some_and(|live| Arc::ptr_eq(&live, &plan.map));
+        let _no_change_under_way = entry.lock_for_change();
+        let was_in_index = plan.map.index.remove(id);
         self.patches.forget(id);
-        if searched
-            && matches!(
-                self.store.get(id),
-                Err(StoreError::ReferenceNotFound { .. })
-            )
-        {
+
+        let index_in_force = entry
+            .live()
+            .is_some_and(|live| Arc::ptr_eq(&live, &plan.map));
+        if !was_in_index || !index_in_force {
+            return;
+        }
+        if let Err(StoreError::ReferenceNotFound { .. }) = self.store.get(id) {
             tracing::error!(reference = %id, "the store has lost a reference; check its database");
             self.metrics.corrupt_records(1);
         }
     }
 
-    /// The first `top_k` that still exist.
+    /// The first `top_k` of the ranking that still exist. Looks up as many as are missing at a
+    /// time, because some may have been deleted since the search.
     fn with_metadata(
         &self,
-        plan: &Plan,
-        placed: Vec<Placed>,
+        plan: &QueryPlan,
+        ranking: Vec<RankedNeighbour>,
     ) -> Result<Vec<QueryResult>, PipelineError> {
-        let top_k = plan.top_k;
-        let mut results = Vec::with_capacity(top_k.min(placed.len()));
-        let mut placed = placed.into_iter().peekable();
-        while results.len() < top_k && placed.peek().is_some() {
-            let batch: Vec<Placed> = placed.by_ref().take(top_k - results.len()).collect();
-            let ids: Vec<ReferenceId> = batch.iter().map(|one| one.neighbour.id).collect();
-            let mut found: HashMap<ReferenceId, Reference> = self
-                .store
-                .get_many(&ids)?
+        let mut results = Vec::with_capacity(plan.top_k.min(ranking.len()));
+        let mut ranking = ranking.into_iter();
+        while results.len() < plan.top_k {
+            let missing = plan.top_k - results.len();
+            let batch: Vec<RankedNeighbour> = ranking.by_ref().take(missing).collect();
+            if batch.is_empty() {
+                break;
+            }
+            let ids: Vec<ReferenceId> = batch.iter().map(|ranked| ranked.neighbour.id).collect();
+            let found = self.store.get_many(&ids)?;
+            let mut found: HashMap<ReferenceId, Reference> = found
                 .into_iter()
                 .map(|reference| (reference.id, reference))
                 .collect();
-            results.extend(batch.into_iter().filter_map(|one| {
-                let Some(reference) = found.remove(&one.neighbour.id) else {
-                    self.withdraw(plan, one.neighbour.id);
-                    return None;
-                };
-                Some(QueryResult {
-                    reference,
-                    global_distance: one.neighbour.distance,
-                    score: one.score,
-                })
-            }));
+            for RankedNeighbour { neighbour, score } in batch {
+                match found.remove(&neighbour.id) {
+                    Some(reference) => results.push(QueryResult {
+                        reference,
+                        global_distance: neighbour.distance,
+                        score,
+                    }),
+                    None => self.withdraw(plan, neighbour.id),
+                }
+            }
         }
         Ok(results)
+    }
+
+    /// How far the best result can be trusted, by the calibration in force; counted in the metrics.
+    fn confidence(
+        &self,
+        plan: &QueryPlan,
+        best: Option<&QueryResult>,
+        reranked: bool,
+    ) -> MatchConfidence {
+        let best = best.map(|best| BestAnswer {
+            spatial_score: best.score.as_ref().map(|score| score.spatial_score),
+            global_distance: best.global_distance,
+        });
+        let own = plan.map.calibration();
+        let confidence = self
+            .calibrations
+            .assess(&plan.map.model, own.as_deref(), best);
+
+        let spatial_score = best.and_then(|best| best.spatial_score).unwrap_or(0);
+        let top1_score = reranked.then_some(spatial_score);
+        self.metrics.query_answered(top1_score, confidence.matched);
+        confidence
     }
 }

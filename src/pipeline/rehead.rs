@@ -1,12 +1,12 @@
 //! Giving a map another head while it is searched.
 //!
-//! The store makes the new vectors beside the old ones, and a new index grows with them; queries go
-//! on with the old index, inserts go into both. Only to change over are inserts and changes of this
-//! map held up, for one small commit: the new index is complete but for what came last. A query
-//! keeps the map it began with, so no answer mixes two heads.
+//! The store writes the new global vectors next to the old ones, and a new index grows with them.
+//! Meanwhile queries use the old index, and inserts go into both. Inserts and changes of this map
+//! have to wait only while the new index replaces the old one, which takes one small commit,
+//! because by then the new index lacks only the last references. A query keeps the index it began
+//! with, so no answer mixes two heads.
 
-use super::maps::{LiveMap, MapEntry, Projection};
-use super::startup::index_entry;
+use super::maps::{Change, LiveMap, MapEntry, Projection, index_entry};
 use super::{PipelineError, Service};
 use bytes::Bytes;
 use placeformer_core::types::{MapName, ModelId};
@@ -23,13 +23,17 @@ impl Service {
     ///
     /// Cancel safety: dropped before it began, nothing is done; dropped later, the exchange runs to
     /// its end.
+    ///
+    /// # Errors
+    /// There is no such map; the file is not a head, or not one for the map's and the server's
+    /// backbone; another head is being prepared; disk or memory is short; the store fails.
     pub async fn set_head(
         self: &Arc<Self>,
         map: MapName,
         file: Option<Bytes>,
     ) -> Result<MapInfo, PipelineError> {
         self.may_store()?;
-        self.in_turn(&self.heads, move |service| {
+        self.run_limited(&self.heads, move |service| {
             service.set_head_now(&map, file.as_deref())
         })
         .await
@@ -40,28 +44,27 @@ impl Service {
         let journal = Journal::begin(&entry)
             .ok_or_else(|| StoreError::ReheadInProgress { map: name.clone() })?;
         let (_, old) = self.existing(name)?;
-        let (head, model) = self.fitting_head(name, file, &old.model)?;
-        let as_wished = match old.projection {
-            Projection::Server => file.is_none(),
-            Projection::Own(_) => file.is_some(),
+        let new = self.fitting_head(name, file, &old.model)?;
+        let has_it_already = match old.projection {
+            Projection::Server => file.is_none() && old.model == new.model,
+            Projection::Own(_) => file.is_some() && old.model == new.model,
             Projection::Foreign | Projection::Lost => false,
         };
-        if !as_wished || old.model != model {
-            self.exchange(name, &entry, journal, (head, model), file)?;
+        if !has_it_already {
+            self.exchange(name, &entry, journal, new)?;
         }
         Ok(self.store.map(name)?)
     }
 
-    /// The head wanted, if the map's vectors can be made with it and this server's queries, too;
-    /// and the map's model with it.
+    /// The head wanted, if both the map's stored vectors and this server's queries can be projected
+    /// with it.
     fn fitting_head(
         &self,
         name: &MapName,
         file: Option<&[u8]>,
         map_model: &ModelId,
-    ) -> Result<(Arc<Head>, ModelId), PipelineError> {
-        let source = self.extraction.source();
-        let server_model = source.model_id();
+    ) -> Result<FittingHead, PipelineError> {
+        let server_model = self.extraction.source().model_id();
         let mismatch = |source| PipelineError::HeadMismatch {
             map: name.clone(),
             source,
@@ -69,48 +72,56 @@ impl Service {
         let head = match file {
             Some(file) => Head::from_bytes(file, Path::new("the file sent"))
                 .map_err(PipelineError::HeadUnreadable)?,
-            None => source
-                .head()
-                .ok_or_else(|| {
-                    mismatch(ExtractError::NoHead {
-                        backbone: server_model.to_string(),
-                    })
-                })?
-                .clone(),
+            None => self.server_head().map_err(mismatch)?,
         };
         let model = head.rebind(map_model).map_err(mismatch)?;
         if head.rebind(server_model).map_err(mismatch)? != model {
-            let (map, map_model, server_model) =
-                (name.clone(), map_model.clone(), server_model.clone());
             return Err(PipelineError::ModelMismatch {
-                map,
-                map_model,
-                server_model,
+                map: name.clone(),
+                map_model: map_model.clone(),
+                server_model: server_model.clone(),
             });
         }
-        Ok((Arc::new(head), model))
+        Ok(FittingHead {
+            head: Arc::new(head),
+            model,
+            file: file.map(<[u8]>::to_vec),
+        })
     }
 
+    fn server_head(&self) -> Result<Head, ExtractError> {
+        let source = self.extraction.source();
+        let head = source.head().ok_or_else(|| ExtractError::NoHead {
+            backbone: source.model_id().to_string(),
+        })?;
+        Ok(head.clone())
+    }
+
+    /// Makes the map's new vectors, in the store and in a new index, and puts the index in force.
     fn exchange(
         &self,
         name: &MapName,
         entry: &MapEntry,
         journal: Journal<'_>,
-        (head, model): (Arc<Head>, ModelId),
-        file: Option<&[u8]>,
+        new: FittingHead,
     ) -> Result<(), PipelineError> {
-        let new = NewHead {
-            model: model.clone(),
-            file: file.map(<[u8]>::to_vec),
+        let projection = match new.file {
+            Some(_) => Projection::Own(new.head.clone()),
+            None => Projection::Server,
+        };
+        let stored = NewHead {
+            model: new.model.clone(),
+            file: new.file,
         };
         let mut exchange = Exchange {
             entry,
-            head: head.clone(),
+            head: new.head,
             entries: IndexBuilder::default(),
             index: None,
             changing: None,
         };
-        self.store.replace_globals(name, new, &mut exchange)?;
+        self.store.replace_globals(name, stored, &mut exchange)?;
+
         let Exchange {
             index,
             entries,
@@ -118,34 +129,43 @@ impl Service {
             ..
         } = exchange;
         let index = index.unwrap_or_else(|| entries.finish());
-        let projection = if file.is_some() {
-            Projection::Own(head)
-        } else {
-            Projection::Server
-        };
-        // In force before it is told what changed: damage that is met meanwhile is either noted or
-        // finds it.
-        let live = entry.put(LiveMap::new(model, projection, index, None));
-        journal
-            .end()
-            .into_iter()
-            .for_each(|change| change.apply(&live.index));
-        tracing::info!(map = %name, references = live.index.len(), model = %live.model, "the map has another head");
+        // The new index is in force before it reads the journal. Damage that is found in between is
+        // therefore either in the journal, or taken out of the new index by whoever found it.
+        let live = entry.put(LiveMap::new(new.model, projection, index, None));
+        for change in journal.end() {
+            change.apply(&live.index);
+        }
+        tracing::info!(
+            map = %name,
+            references = live.index.len(),
+            model = %live.model,
+            "the map has another head"
+        );
         drop(changing);
         Ok(())
     }
 }
 
-/// Notes a map's changes while it lives.
+/// A head that a map can be given.
+struct FittingHead {
+    head: Arc<Head>,
+    /// The map's model with it.
+    model: ModelId,
+    /// The file that the map keeps; none for the server's own head.
+    file: Option<Vec<u8>>,
+}
+
+/// Keeps the journal of a map's changes while it lives.
 struct Journal<'a>(&'a MapEntry);
 
 impl<'a> Journal<'a> {
-    /// None while another one is kept: one head at a time.
+    /// `None` while another journal is kept, because a map is given one head at a time.
     fn begin(entry: &'a MapEntry) -> Option<Self> {
         entry.begin_journal().then_some(Self(entry))
     }
 
-    fn end(self) -> Vec<super::maps::Change> {
+    /// The changes since the beginning.
+    fn end(self) -> Vec<Change> {
         self.0.end_journal()
     }
 }
@@ -156,23 +176,26 @@ impl Drop for Journal<'_> {
     }
 }
 
-/// The new index, as the store converts what it holds.
+/// The new index, which grows as the store converts its references.
 struct Exchange<'a> {
     entry: &'a MapEntry,
     head: Arc<Head>,
     entries: IndexBuilder,
-    /// There once the bulk is converted.
+    /// Present once all references that were there at the beginning are converted.
     index: Option<MapIndex>,
+    /// Keeps inserts and changes waiting from then until the new index is in force.
     changing: Option<RwLockWriteGuard<'a, ()>>,
 }
 
 impl HeadExchange for Exchange<'_> {
     fn project(&mut self, pooled: &[Vec<f32>]) -> Result<Vec<Vec<f32>>, StoreError> {
-        let globals = pooled
+        pooled
             .par_iter()
             .map(|pooled| self.head.project_stored(pooled))
-            .collect();
-        Ok(globals)
+            .collect::<Result<_, _>>()
+            .map_err(|error| StoreError::HeadNotApplied {
+                source: error.into(),
+            })
     }
 
     fn converted(&mut self, row: GlobalRow) {
@@ -184,6 +207,6 @@ impl HeadExchange for Exchange<'_> {
 
     fn finishing(&mut self) {
         self.index = Some(std::mem::take(&mut self.entries).finish());
-        self.changing = Some(self.entry.changing());
+        self.changing = Some(self.entry.lock_for_change());
     }
 }

@@ -1,17 +1,18 @@
-//! The service: everything a request needs, and the questions that need no image.
+//! The service: everything a request needs, the bounds on requests, and the questions that need no
+//! image.
 
-use super::admission::{Admission, Turns};
+use super::admission::{Admission, ConcurrencyLimit};
 use super::blocking::blocking;
+use super::calibrations::Calibrations;
 use super::extraction::Extraction;
 use super::maps::{Change, LiveMap, MapEntry, Maps};
 use super::patches::PatchCache;
-use super::trust::Trust;
 use super::{PipelineConfig, PipelineError};
 use crate::ops::memory::MemoryWatermark;
-use crate::ops::metrics::MemoryComponent;
+use crate::ops::metrics::{MemoryComponent, Rejection};
 use crate::ops::{Health, Metrics};
 use placeformer_core::types::{
-    Calibration, ExternalId, ImageSize, MapName, ModelId, Reference, ReferenceId,
+    Calibration, ExternalId, ImageSize, InvalidValue, MapName, ModelId, Reference, ReferenceId,
 };
 use placeformer_store::{MapInfo, Page, PlaceStore, StoreError};
 use placeformer_vision::rerank::{RerankConfig, Reranker};
@@ -27,18 +28,18 @@ pub struct Service {
     pub(super) rerank_config: RerankConfig,
     pub(super) maps: Maps,
     pub(super) patches: PatchCache,
-    pub(super) trust: Trust,
-    /// The door for queries and matches.
+    pub(super) calibrations: Calibrations,
+    /// Bounds queries and matches.
     pub(super) queries: Arc<Admission>,
-    /// The door for new references.
+    /// Bounds new references.
     pub(super) references: Arc<Admission>,
-    /// Reading the store for anything but a query.
-    pub(super) store_reads: Turns,
-    /// Changing the store for anything but a new reference.
-    pub(super) store_writes: Turns,
-    /// One, for giving maps other heads, which takes minutes.
-    pub(super) heads: Turns,
-    /// Held while the gauges are brought up to date.
+    /// Bounds what reads the store for anything but a query.
+    pub(super) store_reads: ConcurrencyLimit,
+    /// Bounds what changes the store for anything but a new reference.
+    pub(super) store_writes: ConcurrencyLimit,
+    /// Lets one map at a time be given another head, which takes minutes.
+    pub(super) heads: ConcurrencyLimit,
+    /// Locked while the gauges are brought up to date from the store.
     pub(super) observing: Arc<Mutex<()>>,
     pub(super) memory: MemoryWatermark,
     pub(super) config: PipelineConfig,
@@ -51,7 +52,7 @@ pub struct Service {
 pub struct ServiceInfo {
     /// Its model.
     pub model: ModelId,
-    /// The size images are resized to.
+    /// The size in pixels that images are resized to.
     pub input_size: ImageSize,
     /// How candidates are re-ranked.
     pub rerank: RerankConfig,
@@ -64,32 +65,34 @@ pub struct ServiceInfo {
 impl Service {
     /// What this server computes with.
     pub fn info(&self) -> ServiceInfo {
-        let model = self.extraction.source().model_id();
+        let source = self.extraction.source();
+        let model = source.model_id();
         ServiceInfo {
             model: model.clone(),
-            input_size: self.extraction.source().input_size(),
+            input_size: source.input_size(),
             rerank: self.rerank_config.clone(),
             pipeline: self.config.clone(),
-            calibration: self.trust.built_in(model).cloned(),
+            calibration: self.calibrations.built_in(model).cloned(),
         }
     }
 
-    /// Settings of the composition.
+    /// Settings of the pipeline.
     pub fn config(&self) -> &PipelineConfig {
         &self.config
     }
 
-    /// How long a query may wait for its turn.
-    pub(super) fn patience(&self) -> Duration {
-        Duration::from_millis(self.config.max_wait_ms)
-    }
-
     /// One reference's metadata.
+    ///
+    /// # Errors
+    /// There is no such reference, or the store is busy or fails.
     pub async fn reference(self: &Arc<Self>, id: ReferenceId) -> Result<Reference, PipelineError> {
         self.read(move |store| store.get(id)).await
     }
 
-    /// The reference that a map builder named so, if there is one.
+    /// The reference to which a map builder gave this external id, if there is one.
+    ///
+    /// # Errors
+    /// There is no such map, or the store is busy or fails.
     pub async fn find_external(
         self: &Arc<Self>,
         map: MapName,
@@ -100,6 +103,9 @@ impl Service {
     }
 
     /// A page of references, ascending by id.
+    ///
+    /// # Errors
+    /// There is no such map, or the store is busy or fails.
     pub async fn references(
         self: &Arc<Self>,
         map: Option<MapName>,
@@ -111,43 +117,70 @@ impl Service {
     }
 
     /// All maps by name.
+    ///
+    /// # Errors
+    /// The store is busy or fails.
     pub async fn maps(self: &Arc<Self>) -> Result<Vec<MapInfo>, PipelineError> {
         self.read(|store| store.maps()).await
     }
 
     /// One map.
+    ///
+    /// # Errors
+    /// There is no such map, or the store is busy or fails.
     pub async fn map(self: &Arc<Self>, name: MapName) -> Result<MapInfo, PipelineError> {
         self.read(move |store| store.map(&name)).await
     }
 
+    /// Refuses new references while disk or memory is short. Deleting is never refused.
+    ///
+    /// # Errors
+    /// The disk is almost full, or resident memory is above the watermark.
+    pub fn may_store(&self) -> Result<(), PipelineError> {
+        if self.health.is_disk_full() {
+            self.metrics.rejected(Rejection::DiskFull);
+            return Err(PipelineError::DiskFull);
+        }
+        self.memory
+            .check()
+            .inspect_err(|_| self.metrics.rejected(Rejection::MemoryPressure))?;
+        Ok(())
+    }
+
+    /// Bounds the metadata of a reference.
+    pub(super) fn check_metadata(
+        &self,
+        metadata: Option<&serde_json::Map<String, serde_json::Value>>,
+    ) -> Result<(), PipelineError> {
+        let Some(metadata) = metadata else {
+            return Ok(());
+        };
+        let length = serde_json::to_vec(metadata).map_or(usize::MAX, |text| text.len());
+        let bound = self.config.max_metadata_bytes;
+        if length > bound {
+            let reason = format!("{length} bytes of JSON are more than the {bound} allowed");
+            return Err(InvalidValue::new("metadata", reason).into());
+        }
+        Ok(())
+    }
+
     /// Brings the gauges up to date, before they are read.
+    ///
+    /// Cancel safety: dropped at any point, some gauges keep their old values.
     pub async fn observe(self: &Arc<Self>) {
-        let maps = self.maps.all();
-        let index: usize = maps.iter().map(|(_, live)| live.index.memory_bytes()).sum();
-        self.metrics
-            .set_memory(MemoryComponent::Index, index as u64);
-        self.metrics
-            .set_memory(MemoryComponent::Cache, self.patches.bytes());
-        self.metrics.set_memory(
-            MemoryComponent::Model,
-            self.extraction.source().memory_bytes(),
-        );
-        self.metrics.set_references(
-            maps.iter()
-                .map(|(name, live)| (name.to_string(), live.index.len() as u64))
-                .collect(),
-        );
-        // Never more than one at the store, whoever else asks; those see what this one finds.
-        let Ok(turn) = self.observing.clone().try_lock_owned() else {
+        self.observe_memory();
+        // At most one task asks the store at a time. The others read what that one finds.
+        let Ok(observing) = self.observing.clone().try_lock_owned() else {
             return;
         };
         let store = self.store.clone();
-        let seen = blocking(move || {
-            let seen = (store.footprint(), store.quarantined());
-            drop(turn);
-            seen
+        let asking = blocking(move || {
+            let footprint = store.footprint();
+            let quarantined = store.quarantined();
+            drop(observing);
+            (footprint, quarantined)
         });
-        let Ok((footprint, quarantined)) = seen.await else {
+        let Ok((footprint, quarantined)) = asking.await else {
             return;
         };
         match footprint {
@@ -162,7 +195,22 @@ impl Service {
         }
     }
 
-    /// Counts damage that the store has met, and stops searching for what it no longer serves.
+    fn observe_memory(&self) {
+        let maps = self.maps.all();
+        let index: usize = maps.iter().map(|(_, live)| live.index.memory_bytes()).sum();
+        let model = self.extraction.source().memory_bytes();
+        let metrics = &self.metrics;
+        metrics.set_memory(MemoryComponent::Index, index as u64);
+        metrics.set_memory(MemoryComponent::Cache, self.patches.bytes());
+        metrics.set_memory(MemoryComponent::Model, model);
+
+        let sizes = maps
+            .iter()
+            .map(|(name, live)| (name.to_string(), live.index.len() as u64));
+        metrics.set_references(sizes.collect());
+    }
+
+    /// Counts damage that the store has found, and stops searching for what it no longer serves.
     pub(super) fn follow_damage(&self) {
         let damage = self.store.drain_damage();
         self.metrics.corrupt_records(damage.found);
@@ -171,70 +219,84 @@ impl Service {
         }
         for entry in self.maps.entries() {
             for &id in &damage.withdrawn {
-                // Noted first: a new index is either in force already or still to be told.
+                // Another head may be replacing this map's index right now. The change is noted
+                // before the index is looked up, so the new index loses the reference either way:
+                // it is the one found below, or it comes later and reads the journal.
                 entry.note(Change::Deleted(id));
                 if let Some(live) = entry.live() {
                     live.index.remove(id);
                 }
             }
         }
-        damage
-            .withdrawn
-            .iter()
-            .for_each(|&id| self.patches.forget(id));
+        for &id in &damage.withdrawn {
+            self.patches.forget(id);
+        }
     }
 
-    /// A map that lives.
+    /// A map that exists, with its entry.
     pub(super) fn existing(
         &self,
         name: &MapName,
     ) -> Result<(Arc<MapEntry>, Arc<LiveMap>), PipelineError> {
-        let found = self
-            .maps
-            .get(name)
-            .and_then(|entry| Some((entry.clone(), entry.live()?)));
-        found.ok_or_else(|| self.why_no_map(name))
+        if let Some(entry) = self.maps.get(name)
+            && let Some(live) = entry.live()
+        {
+            return Ok((entry, live));
+        }
+        Err(self.missing_map(name))
     }
 
-    /// A map that does not live does not exist, or its record is damaged. Reads the store.
-    pub(super) fn why_no_map(&self, name: &MapName) -> PipelineError {
+    /// Why a map cannot be searched: its record in the store is damaged, or it does not exist.
+    /// Reads the store.
+    pub(super) fn missing_map(&self, name: &MapName) -> PipelineError {
         match self.store.map(name) {
             Err(error @ StoreError::CorruptMap { .. }) => error.into(),
             _ => PipelineError::MapNotFound(name.clone()),
         }
     }
 
-    /// Reads the store in turn with others.
+    /// Longest time that a request may wait to be served.
+    pub(super) fn max_wait(&self) -> Duration {
+        Duration::from_millis(self.config.max_wait_ms)
+    }
+
+    /// Counts a request that ended because its deadline passed.
+    pub(super) fn count_if_late<T>(&self, outcome: &Result<T, PipelineError>) {
+        if let Err(PipelineError::DeadlineExceeded { .. }) = outcome {
+            self.metrics.rejected(Rejection::Deadline);
+        }
+    }
+
+    /// Reads the store, on no more threads at once than `store_reads` of the settings.
     ///
-    /// Cancel safety: dropped while waiting, nothing is read; dropped later, the read holds its
-    /// place until it ends.
-    pub(super) async fn read<T: Send + 'static>(
+    /// Cancel safety: dropped while waiting, nothing is read; dropped later, the read keeps its
+    /// permit until it ends.
+    async fn read<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&dyn PlaceStore) -> Result<T, StoreError> + Send + 'static,
     ) -> Result<T, PipelineError> {
-        self.in_turn(&self.store_reads, |service| Ok(work(&*service.store)?))
+        self.run_limited(&self.store_reads, |service| Ok(work(&*service.store)?))
             .await
     }
 
-    /// Runs `work` when its turn has come, and follows what damage it met.
+    /// Runs `work` on a blocking thread once `limit` allows, and follows the damage it found.
     ///
     /// Cancel safety: dropped while waiting, nothing is done; dropped later, the work runs to its
-    /// end in its place.
-    pub(super) async fn in_turn<T: Send + 'static>(
+    /// end and keeps its permit until then.
+    pub(super) async fn run_limited<T: Send + 'static>(
         self: &Arc<Self>,
-        turns: &Turns,
+        limit: &ConcurrencyLimit,
         work: impl FnOnce(&Self) -> Result<T, PipelineError> + Send + 'static,
     ) -> Result<T, PipelineError> {
-        let place = turns.take(self.patience()).await?;
+        let permit = limit.acquire(self.max_wait()).await?;
         let service = self.clone();
         let outcome = blocking(move || {
             let outcome = work(&service);
             service.follow_damage();
-            drop(place);
+            drop(permit);
             outcome
         });
-        outcome
-            .await
-            .map_err(|_| PipelineError::Panicked { stage: "the store" })?
+        let panicked = |_| PipelineError::Panicked { stage: "the store" };
+        outcome.await.map_err(panicked)?
     }
 }

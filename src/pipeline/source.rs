@@ -6,17 +6,24 @@ use placeformer_vision::image::{self, ImageConfig, ImageError};
 
 /// What turns images into descriptors. Production uses [`Extractor`].
 pub trait DescriptorSource: Send + Sync + 'static {
-    /// What its descriptors may be compared with.
+    /// The model, which only descriptors of the same model may be compared with.
     fn model_id(&self) -> &ModelId;
     /// The head behind its global descriptors; without one they are the pooled tokens.
     fn head(&self) -> Option<&Head>;
-    /// The size images must be resized to.
+    /// The size in pixels that images must be resized to.
     fn input_size(&self) -> ImageSize;
-    /// What the model sees of an image as it was sent. Blocks for the whole computation.
+    /// The tensor that the model takes, from the bytes of an image as it was sent. Blocks for the
+    /// whole computation.
+    ///
+    /// # Errors
+    /// The image is refused or cannot be decoded.
     fn decode(&self, bytes: &[u8], config: &ImageConfig) -> Result<ImageTensor, ImageError> {
         image::load_tensor(bytes, config, self.input_size())
     }
     /// One descriptor per image. Blocks for the whole computation.
+    ///
+    /// # Errors
+    /// The tensors have another shape than the model takes, or its computation fails.
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError>;
     /// Bytes of weights in memory.
     fn memory_bytes(&self) -> u64;

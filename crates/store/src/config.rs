@@ -2,13 +2,16 @@
 
 use placeformer_core::types::InvalidValue;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 /// Most connections, and most waiting writes. Each reader keeps files open and each waiting write
 /// keeps a descriptor in memory, so a larger number can only be a mistake.
 const MOST_AT_ONCE: usize = 65_536;
 
 /// Settings of the embedded store.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+///
+/// The comments of the fields are printed as the manual of the configuration file.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct StoreConfig {
     /// Most reading connections open at once, 1 to 65536. They are opened when needed and kept;

@@ -99,6 +99,12 @@ pub enum StoreError {
         /// Which rule it breaks.
         reason: String,
     },
+    /// The new head could not be applied to the pooled vectors of the map.
+    #[error("the new head does not fit what the map keeps of its images")]
+    HeadNotApplied {
+        /// What the caller's projection said.
+        source: EngineCause,
+    },
     /// No space is left for writing; reading and deleting still work.
     #[error("no space is left on the disk of the data directory")]
     DiskFull,
@@ -180,6 +186,7 @@ impl StoreError {
             Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
             Self::ModelMismatch { .. } => ErrorCode::ModelMismatch,
             Self::CalibrationMismatch { .. } => ErrorCode::CalibrationMismatch,
+            Self::HeadNotApplied { .. } => ErrorCode::HeadMismatch,
             Self::CorruptRecord { .. }
             | Self::CorruptMap { .. }
             | Self::CorruptHead { .. }

@@ -5,7 +5,7 @@ use crate::http::body::{ImageUpload, read_upload};
 use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
-use crate::pipeline::{MatchSide, Matched};
+use crate::pipeline::{MatchTarget, MatchedPair};
 use axum::extract::{Request, State};
 use axum::response::Response;
 use placeformer_core::types::ReferenceId;
@@ -119,8 +119,8 @@ pub async fn match_images(
     let query = upload.take("query")?;
     let reference_id = std::mem::take(&mut upload.params).checked()?;
     let other = match (upload.take_optional("reference")?, reference_id) {
-        (Some(image), None) => MatchSide::Image(image),
-        (None, Some(id)) => MatchSide::Reference(id),
+        (Some(image), None) => MatchTarget::Image(image),
+        (None, Some(id)) => MatchTarget::Reference(id),
         _ => {
             return Err(ApiError::invalid(
                 "give either the image \"reference\" or reference_id",
@@ -148,7 +148,7 @@ pub async fn match_images(
     Ok(timed(body, &answer.timings))
 }
 
-fn combination_body(pair: &Matched, combination: &CombinationMatch) -> CombinationMatchBody {
+fn combination_body(pair: &MatchedPair, combination: &CombinationMatch) -> CombinationMatchBody {
     let mut correspondences = Vec::with_capacity(combination.correspondences.len());
     for correspondence in &combination.correspondences {
         let query = correspondence.query as usize;

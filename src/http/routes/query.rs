@@ -278,8 +278,8 @@ fn respond(answer: QueryAnswer) -> Response {
     let body = QueryAnswerBody {
         results,
         reranked: answer.reranked,
-        matched: answer.verdict.matched,
-        confidence: answer.verdict.confidence,
+        matched: answer.confidence.matched,
+        confidence: answer.confidence.confidence,
         timings_ms: timings_ms(&answer.timings),
         model: answer.model.to_string(),
     };

@@ -108,10 +108,12 @@ struct Projecting<'a>(&'a Head);
 
 impl HeadExchange for Projecting<'_> {
     fn project(&mut self, pooled: &[Vec<f32>]) -> Result<Vec<Vec<f32>>, StoreError> {
-        let globals = pooled
+        pooled
             .par_iter()
             .map(|pooled| self.0.project_stored(pooled))
-            .collect();
-        Ok(globals)
+            .collect::<Result<_, _>>()
+            .map_err(|error| StoreError::HeadNotApplied {
+                source: error.into(),
+            })
     }
 }

@@ -8,45 +8,57 @@ use std::convert::Infallible;
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
+use utoipa::ToSchema;
 
-/// Settings of extraction. A setting that is `None` takes the preset's value; see
-/// [`ExtractConfig::effective`].
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// Settings of extraction. What is `None` is the preset's own; see [`ExtractConfig::effective`].
+/// The comments of the fields are printed as the manual of the configuration file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ExtractConfig {
-    /// The backbone.
+    /// The backbone: dinov2-vits14, dinov2-vitb14, dinov2-vitl14 or placeformer-vits16.
+    #[schema(value_type = String)]
     pub preset: Preset,
-    /// A weights file for the preset's geometry. Unless set, the preset's published weights are
-    /// used, and downloaded on first use.
+    /// Weights file of your own for that backbone: safetensors with the tensor names of timm, DINO
+    /// or Hugging Face, or what `train` wrote. Unless set, the published weights are pulled on
+    /// first use.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
     pub weights: Option<PathBuf>,
-    /// Size in pixels to which images are resized; each side a multiple of the patch size.
+    /// Size in pixels that images are squashed to, such as { width = 448, height = 336 }. Each side
+    /// is a multiple of the patch size. Unless set, it is the preset's own.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<Object>)]
     pub input_size: Option<ImageSize>,
-    /// Number, from 0, of the block whose output tokens are used. Later blocks are not computed.
+    /// 0-based block of the transformer whose tokens are used; later blocks are not computed.
+    /// Unless set, it is the preset's own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exit_block: Option<usize>,
-    /// Whether the tokens pass the final LayerNorm.
+    /// Whether the tokens pass the final LayerNorm. Unless set, it is the preset's own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub token_norm: Option<bool>,
-    /// Number, from 0, of the block whose CLS attention ranks the patches; the exit block unless
-    /// set.
+    /// 0-based block whose CLS attention ranks the patches. Unless set, it is the exit block.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub attention_block: Option<usize>,
-    /// Number of attention heads, for weights that were trained with another number than the preset
-    /// has. It cannot be seen from the shape of any tensor.
+    /// Number of attention heads, for weights trained with another count than the preset's, which
+    /// no tensor's shape reveals.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub heads: Option<usize>,
-    /// Key patches must exceed this multiple of the uniform attention heads/n; 1 is the paper's
-    /// 0.01 (III-C).
+    /// The attention of a key patch must exceed this multiple of uniform attention, which is the
+    /// number of heads by the number of patches; 1 is the paper's tau of 0.01.
     pub tau: f32,
     /// Most key patches at scales 1, 2 and 3 (paper III-C).
     pub caps: [usize; SCALES],
-    /// Distance between the windows that are pooled at scales 2 and 3 (paper III-B).
+    /// Distance between fused windows: "kernel" (no overlap) or "one" (a window at every patch).
+    #[schema(value_type = String)]
     pub stride: PoolingStride,
-    /// The projection to the global descriptor (paper III-A): `default`, `none`, or a file.
+    /// Projection to the global descriptor: "default" (the one built in for the backbone and its
+    /// published weights) or a file, as `head fit`, `head train` or `train` wrote it. "none" is for
+    /// evaluation only, because maps are searched by the projection's output.
+    #[schema(value_type = String)]
     pub head: HeadChoice,
-    /// Arithmetic of the linear layers.
+    /// Arithmetic of the transformer: f32, bf16, int8, mixed (int8 in the blocks where it shows
+    /// least, bf16 in the others), or auto (mixed where the CPU has AVX-512 VNNI, else f32).
+    #[schema(value_type = String)]
     pub precision: Precision,
 }
 

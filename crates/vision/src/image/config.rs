@@ -2,9 +2,12 @@
 
 use placeformer_core::types::InvalidValue;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 /// Limits that are checked before anything is decoded.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+///
+/// The comments of the fields are printed as the manual of the configuration file.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ImageConfig {
     /// Most bytes of an encoded image.

@@ -2,19 +2,25 @@
 
 use placeformer_core::types::{InvalidValue, RerankId, ScaleSet};
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 /// Settings of re-ranking.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+///
+/// The comments of the fields are printed as the manual of the configuration file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct RerankConfig {
-    /// The combinations of scales whose inlier counts add up to S (paper III-E).
+    /// The scale combinations whose inlier counts add up to the spatial score S. The best row of
+    /// the paper's table is 1, 1+2, 2+3.
+    #[schema(value_type = Vec<String>)]
     pub scales: Vec<ScaleSet>,
-    /// Inlier tolerance in multiples of the base patch size.
+    /// Inlier tolerance of the homography in multiples of the base patch size.
     pub tolerance_patches: f32,
-    /// Most homographies that are scored for one combination. Samples of four pairs that no
-    /// homography of a plane can explain are rejected before, and do not count.
+    /// Most homographies scored for one combination; samples refused as degenerate or twisted do
+    /// not count.
     pub max_iterations: u32,
-    /// The search stops early once a sample without outliers has been drawn with this probability.
+    /// The search for a homography stops early once the best one has been seen with this
+    /// probability.
     pub confidence: f64,
 }
 

@@ -17,7 +17,7 @@ use std::ops::Range;
 /// Columns of the MLP's hidden layer that exist at a time.
 pub(crate) const HIDDEN_SLICE: usize = 384;
 
-/// WordRows whose sums exist at a time, few enough that their epilogue finds them in the first-level
+/// Rows whose sums exist at a time, few enough that their epilogue finds them in the first-level
 /// cache. A multiple of the tile heights and panel sizes of every level.
 const BLOCK_ROWS: usize = 192;
 

@@ -1,0 +1,129 @@
+//! The values that labels of the series can have.
+
+/// A stage of the pipeline, as a label and in the timings of an answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum PipelineStage {
+    /// Bytes to a tensor.
+    Decode,
+    /// Waiting for the compute worker.
+    Queue,
+    /// Tensor to descriptor.
+    Extract,
+    /// Global nearest neighbours.
+    Search,
+    /// Candidates' key patches from the store.
+    Load,
+    /// Matching and verification.
+    Rerank,
+    /// Writing to the store, until it is durable.
+    Commit,
+}
+
+impl PipelineStage {
+    /// All stages in the order of the data.
+    pub const ALL: [Self; 7] = [
+        Self::Decode,
+        Self::Queue,
+        Self::Extract,
+        Self::Search,
+        Self::Load,
+        Self::Rerank,
+        Self::Commit,
+    ];
+
+    /// Its label.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Decode => "decode",
+            Self::Queue => "queue",
+            Self::Extract => "extract",
+            Self::Search => "search",
+            Self::Load => "load",
+            Self::Rerank => "rerank",
+            Self::Commit => "commit",
+        }
+    }
+}
+
+/// Why work was turned away; the values of `rejected_total{reason}`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Rejection {
+    /// The compute queue is full.
+    QueueFull,
+    /// Too many others read or change the store.
+    StoreBusy,
+    /// Too many bytes of bodies are being received.
+    BodyMemory,
+    /// The key's rate is used up.
+    RateLimited,
+    /// Resident memory is above the watermark.
+    MemoryPressure,
+    /// No room to store it.
+    DiskFull,
+    /// Still starting.
+    NotReady,
+    /// Stopping.
+    Draining,
+    /// Its deadline passed.
+    Deadline,
+    /// Its client left.
+    ClientGone,
+}
+
+impl Rejection {
+    /// All reasons.
+    pub const ALL: [Self; 10] = [
+        Self::QueueFull,
+        Self::StoreBusy,
+        Self::BodyMemory,
+        Self::RateLimited,
+        Self::MemoryPressure,
+        Self::DiskFull,
+        Self::NotReady,
+        Self::Draining,
+        Self::Deadline,
+        Self::ClientGone,
+    ];
+
+    /// Its label.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::QueueFull => "queue_full",
+            Self::StoreBusy => "store_busy",
+            Self::BodyMemory => "body_memory",
+            Self::RateLimited => "rate_limited",
+            Self::MemoryPressure => "memory_pressure",
+            Self::DiskFull => "disk_full",
+            Self::NotReady => "not_ready",
+            Self::Draining => "draining",
+            Self::Deadline => "deadline",
+            Self::ClientGone => "client_gone",
+        }
+    }
+}
+
+/// A component whose memory is known; the values of `memory_bytes{component}`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MemoryComponent {
+    /// Weights.
+    Model,
+    /// Global descriptors of all maps.
+    Index,
+    /// Key patches kept for the next query.
+    Cache,
+    /// The database engine's own caches.
+    Sqlite,
+}
+
+impl MemoryComponent {
+    pub(super) const ALL: [Self; 4] = [Self::Model, Self::Index, Self::Cache, Self::Sqlite];
+
+    pub(super) fn as_str(self) -> &'static str {
+        match self {
+            Self::Model => "model",
+            Self::Index => "index",
+            Self::Cache => "cache",
+            Self::Sqlite => "sqlite",
+        }
+    }
+}

@@ -1,0 +1,411 @@
+//! Everything the service measures, in Prometheus' terms.
+//!
+//! Every series is registered and set to zero at start, so that an alert on a rate works from the
+//! first minute. Labels are bounded: routes are matched paths, and maps beyond the largest fifty
+//! are added up as `other`.
+
+mod labels;
+
+pub use labels::{MemoryComponent, PipelineStage, Rejection};
+
+use prometheus::core::Collector;
+use prometheus::process_collector::ProcessCollector;
+use prometheus::{
+    Encoder, Error, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge,
+    IntGaugeVec, Opts, Registry, TextEncoder,
+};
+use std::time::Duration;
+
+/// Upper bounds in seconds, 1 ms to 10 s.
+const SECONDS: [f64; 16] = [
+    0.001, 0.002, 0.004, 0.008, 0.015, 0.025, 0.04, 0.06, 0.1, 0.2, 0.4, 0.8, 1.5, 3.0, 6.0, 10.0,
+];
+
+/// Upper bounds of the spatial score S.
+const SCORES: [f64; 14] = [
+    0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0, 500.0, 800.0,
+];
+
+/// Upper bounds in bytes, 1 KiB to 1 MiB.
+const BYTES: [f64; 11] = [
+    1024.0,
+    2048.0,
+    4096.0,
+    8192.0,
+    16384.0,
+    32768.0,
+    65536.0,
+    131_072.0,
+    262_144.0,
+    524_288.0,
+    1_048_576.0,
+];
+
+/// Maps with a series of their own.
+const MAPS_SHOWN: usize = 50;
+
+/// Label of the maps that have no series of their own.
+const OTHER_MAPS: &str = "other";
+
+/// All series. Cheap to share behind an `Arc`; every method is safe from any thread.
+pub struct Metrics {
+    registry: Registry,
+    requests: RequestSeries,
+    stage_seconds: HistogramVec,
+    queue_depth: IntGauge,
+    rejected: IntCounterVec,
+    references: IntGaugeVec,
+    descriptor_bytes: HistogramVec,
+    memory_bytes: IntGaugeVec,
+    queries: QuerySeries,
+    corrupt_records: IntCounter,
+    quarantined: IntGauge,
+    ready: IntGauge,
+    disk_free_bytes: IntGauge,
+    cache_lookups: IntCounterVec,
+}
+
+impl Metrics {
+    /// Registers every series.
+    ///
+    /// # Errors
+    /// Two series share a name.
+    pub fn new() -> Result<Self, Error> {
+        let series = Series(Registry::new());
+        series.add(ProcessCollector::for_self())?;
+        series
+            .gauges("build_info", "Always 1.", &["version"])?
+            .with_label_values(&[env!("CARGO_PKG_VERSION")])
+            .set(1);
+        let metrics = Self {
+            requests: RequestSeries::new(&series)?,
+            stage_seconds: series.histograms(
+                "stage_duration_seconds",
+                "Time in a stage.",
+                &["stage"],
+                &SECONDS,
+            )?,
+            queue_depth: series.gauge("queue_depth", "Requests waiting for or in compute.")?,
+            rejected: series.counters("rejected_total", "Work turned away.", &["reason"])?,
+            references: series.gauges("references", "References that can be found.", &["map"])?,
+            descriptor_bytes: series.histograms(
+                "descriptor_bytes",
+                "Size of a stored descriptor.",
+                &["kind"],
+                &BYTES,
+            )?,
+            memory_bytes: series.gauges("memory_bytes", "Memory by component.", &["component"])?,
+            queries: QuerySeries::new(&series)?,
+            corrupt_records: series.counter(
+                "corrupt_records_total",
+                "Damaged records found, at start or by any request.",
+            )?,
+            quarantined: series.gauge(
+                "quarantined_references",
+                "Damaged references set aside, not served.",
+            )?,
+            ready: series.gauge(
+                "ready",
+                "1 if queries are answered (/readyz?for=query), else 0.",
+            )?,
+            disk_free_bytes: series.gauge("disk_free_bytes", "Free bytes on the store's disk.")?,
+            cache_lookups: series.counters(
+                "patch_cache_lookups_total",
+                "Key patches asked of the cache.",
+                &["result"],
+            )?,
+            registry: series.0,
+        };
+        metrics.start_at_zero();
+        Ok(metrics)
+    }
+
+    fn start_at_zero(&self) {
+        for stage in PipelineStage::ALL {
+            self.stage_seconds.with_label_values(&[stage.as_str()]);
+        }
+        for reason in Rejection::ALL {
+            self.rejected.with_label_values(&[reason.as_str()]);
+        }
+        for component in MemoryComponent::ALL {
+            self.memory_bytes.with_label_values(&[component.as_str()]);
+        }
+        for kind in ["global", "patches"] {
+            self.descriptor_bytes.with_label_values(&[kind]);
+        }
+        for result in ["hit", "miss"] {
+            self.cache_lookups.with_label_values(&[result]);
+        }
+        self.references.with_label_values(&[OTHER_MAPS]);
+    }
+
+    /// Makes the series of a route appear with zeros, one for each status it documents.
+    pub fn expect_route(&self, route: &str, method: &str, statuses: impl IntoIterator<Item = u16>) {
+        self.requests.seconds.with_label_values(&[route]);
+        for status in statuses {
+            self.requests
+                .answered
+                .with_label_values(&[route, method, &status.to_string()]);
+        }
+    }
+
+    /// One request was answered.
+    pub fn request(&self, route: &str, method: &str, status: u16, took: Duration) {
+        self.requests
+            .answered
+            .with_label_values(&[route, method, &status.to_string()])
+            .inc();
+        self.requests
+            .seconds
+            .with_label_values(&[route])
+            .observe(took.as_secs_f64());
+    }
+
+    /// A stage took this long.
+    pub fn stage(&self, stage: PipelineStage, took: Duration) {
+        self.stage_seconds
+            .with_label_values(&[stage.as_str()])
+            .observe(took.as_secs_f64());
+    }
+
+    /// Work was turned away.
+    pub fn rejected(&self, reason: Rejection) {
+        self.rejected.with_label_values(&[reason.as_str()]).inc();
+    }
+
+    /// A request joined those waiting for or in compute.
+    pub fn queue_entered(&self) {
+        self.queue_depth.inc();
+    }
+
+    /// A request left them.
+    pub fn queue_left(&self) {
+        self.queue_depth.dec();
+    }
+
+    /// A reference was stored with descriptors of these sizes in bytes.
+    pub fn stored_descriptor(&self, global: usize, patches: usize) {
+        self.descriptor_bytes
+            .with_label_values(&["global"])
+            .observe(global as f64);
+        self.descriptor_bytes
+            .with_label_values(&["patches"])
+            .observe(patches as f64);
+    }
+
+    /// A query was answered. `top1_score` is the S of its best result: 0 without any result, `None`
+    /// if it was not re-ranked. `matched` says whether that result is trusted: `None` without a
+    /// calibration.
+    pub fn query_answered(&self, top1_score: Option<u32>, matched: Option<bool>) {
+        if let Some(score) = top1_score {
+            self.queries.top1_score.observe(f64::from(score));
+        }
+        if matched == Some(false) {
+            self.queries.unmatched.inc();
+        }
+    }
+
+    /// So many damaged records were found that had not been found before.
+    pub fn corrupt_records(&self, records: u64) {
+        self.corrupt_records.inc_by(records);
+    }
+
+    /// Damaged references that are set aside until they are sent again or deleted.
+    pub fn set_quarantined(&self, references: usize) {
+        self.quarantined.set(references as i64);
+    }
+
+    /// Whether queries are answered.
+    pub fn set_ready(&self, ready: bool) {
+        self.ready.set(i64::from(ready));
+    }
+
+    /// Free bytes on the disk that holds the store.
+    pub fn set_disk_free(&self, bytes: u64) {
+        self.disk_free_bytes
+            .set(i64::try_from(bytes).unwrap_or(i64::MAX));
+    }
+
+    /// The patch cache was asked for the key patches of a reference.
+    pub fn cache_lookup(&self, hit: bool) {
+        self.cache_lookups
+            .with_label_values(&[if hit { "hit" } else { "miss" }])
+            .inc();
+    }
+
+    /// Memory of a component in bytes.
+    pub fn set_memory(&self, component: MemoryComponent, bytes: u64) {
+        self.memory_bytes
+            .with_label_values(&[component.as_str()])
+            .set(bytes as i64);
+    }
+
+    /// References per map; the largest [`MAPS_SHOWN`] keep their name.
+    pub fn set_references(&self, mut maps: Vec<(String, u64)>) {
+        maps.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
+        let rest = maps.split_off(maps.len().min(MAPS_SHOWN));
+        self.references.reset();
+        for (map, count) in &maps {
+            self.references.with_label_values(&[map]).set(*count as i64);
+        }
+        let other: u64 = rest.iter().map(|(_, count)| count).sum();
+        // Added, because a map may have that name, too.
+        self.references
+            .with_label_values(&[OTHER_MAPS])
+            .add(other as i64);
+    }
+
+    /// All series in Prometheus' text format.
+    ///
+    /// # Errors
+    /// A series cannot be written as text.
+    pub fn render(&self) -> Result<String, Error> {
+        TextEncoder::new().encode_to_string(&self.registry.gather())
+    }
+
+    /// Content type of [`Metrics::render`].
+    pub fn content_type() -> String {
+        TextEncoder::new().format_type().to_owned()
+    }
+}
+
+/// What became of HTTP requests.
+struct RequestSeries {
+    answered: IntCounterVec,
+    seconds: HistogramVec,
+}
+
+impl RequestSeries {
+    fn new(series: &Series) -> Result<Self, Error> {
+        Ok(Self {
+            answered: series.counters(
+                "http_requests_total",
+                "Requests answered.",
+                &["route", "method", "status"],
+            )?,
+            seconds: series.histograms(
+                "http_request_duration_seconds",
+                "Time to an answer.",
+                &["route"],
+                &SECONDS,
+            )?,
+        })
+    }
+}
+
+/// How good the answers of queries are.
+struct QuerySeries {
+    top1_score: Histogram,
+    unmatched: IntCounter,
+}
+
+impl QuerySeries {
+    fn new(series: &Series) -> Result<Self, Error> {
+        Ok(Self {
+            top1_score: series.histogram(
+                "query_top1_score",
+                "S of the best answer after re-ranking.",
+                &SCORES,
+            )?,
+            unmatched: series.counter(
+                "query_unmatched_total",
+                "Queries whose best answer is not trusted.",
+            )?,
+        })
+    }
+}
+
+/// Makes series and registers them. Names are given without the prefix of the service.
+struct Series(Registry);
+
+impl Series {
+    fn add<C: Collector + 'static>(&self, collector: C) -> Result<(), Error> {
+        self.0.register(Box::new(collector))
+    }
+
+    fn counter(&self, name: &str, help: &str) -> Result<IntCounter, Error> {
+        let counter = IntCounter::with_opts(options(name, help))?;
+        self.add(counter.clone())?;
+        Ok(counter)
+    }
+
+    fn counters(&self, name: &str, help: &str, labels: &[&str]) -> Result<IntCounterVec, Error> {
+        let counters = IntCounterVec::new(options(name, help), labels)?;
+        self.add(counters.clone())?;
+        Ok(counters)
+    }
+
+    fn gauge(&self, name: &str, help: &str) -> Result<IntGauge, Error> {
+        let gauge = IntGauge::with_opts(options(name, help))?;
+        self.add(gauge.clone())?;
+        Ok(gauge)
+    }
+
+    fn gauges(&self, name: &str, help: &str, labels: &[&str]) -> Result<IntGaugeVec, Error> {
+        let gauges = IntGaugeVec::new(options(name, help), labels)?;
+        self.add(gauges.clone())?;
+        Ok(gauges)
+    }
+
+    fn histogram(&self, name: &str, help: &str, bounds: &[f64]) -> Result<Histogram, Error> {
+        let options = HistogramOpts::from(options(name, help)).buckets(bounds.to_vec());
+        let histogram = Histogram::with_opts(options)?;
+        self.add(histogram.clone())?;
+        Ok(histogram)
+    }
+
+    fn histograms(
+        &self,
+        name: &str,
+        help: &str,
+        labels: &[&str],
+        bounds: &[f64],
+    ) -> Result<HistogramVec, Error> {
+        let options = HistogramOpts::from(options(name, help)).buckets(bounds.to_vec());
+        let histograms = HistogramVec::new(options, labels)?;
+        self.add(histograms.clone())?;
+        Ok(histograms)
+    }
+}
+
+fn options(name: &str, help: &str) -> Opts {
+    Opts::new(format!("placeformer_{name}"), help)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_series_of_the_design_is_there_from_the_start() {
+        let text = Metrics::new().unwrap().render().unwrap();
+        for series in [
+            "placeformer_stage_duration_seconds_count{stage=\"commit\"} 0",
+            "placeformer_rejected_total{reason=\"queue_full\"} 0",
+            "placeformer_memory_bytes{component=\"index\"} 0",
+            "placeformer_descriptor_bytes_count{kind=\"patches\"} 0",
+            "placeformer_queue_depth 0",
+            "placeformer_query_top1_score_count 0",
+            "placeformer_query_unmatched_total 0",
+            "placeformer_build_info{version=",
+            "process_resident_memory_bytes",
+        ] {
+            assert!(text.contains(series), "{series} is missing in\n{text}");
+        }
+    }
+
+    #[test]
+    fn maps_beyond_fifty_fold_into_other() {
+        let metrics = Metrics::new().unwrap();
+        metrics.set_references((0..60).map(|i| (format!("map{i:02}"), 100 - i)).collect());
+        let text = metrics.render().unwrap();
+        assert_eq!(
+            text.lines()
+                .filter(|line| line.starts_with("placeformer_references{"))
+                .count(),
+            51
+        );
+        let folded: u64 = (50..60).map(|i| 100 - i).sum();
+        assert!(text.contains(&format!("placeformer_references{{map=\"other\"}} {folded}")));
+    }
+}

@@ -1,0 +1,246 @@
+//! Whether a best answer can be trusted: judged by the calibration of its map, else by that of the
+//! model. Where there is neither, the answer says nothing about it.
+
+use super::PipelineError;
+use placeformer_core::types::{Calibration, ConfidenceCurve, MapName, ModelId, RerankId};
+use placeformer_models::built_in_calibrations;
+
+/// How far the best answer can be trusted.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct MatchConfidence {
+    /// Whether the best answer is trusted; `None` where no calibration can be used.
+    pub matched: Option<bool>,
+    /// Probability, 0 to 1, that the best answer is right; `None` where no calibration can be used.
+    pub confidence: Option<f64>,
+}
+
+/// What the best answer of a query is judged by.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct BestAnswer {
+    /// Its score S; absent if it was not re-ranked.
+    pub(super) spatial_score: Option<u32>,
+    /// Euclidean distance between its global descriptor and the query's.
+    pub(super) global_distance: f32,
+}
+
+/// The calibrations that come with this server, and the re-ranking on whose scores it answers.
+pub(super) struct Calibrations {
+    built_in: Vec<Calibration>,
+    rerank: RerankId,
+}
+
+impl Calibrations {
+    /// For a server that re-ranks as `rerank` says.
+    pub(super) fn new(rerank: RerankId) -> Self {
+        Self {
+            built_in: built_in_calibrations().collect(),
+            rerank,
+        }
+    }
+
+    /// The calibration of `model` itself.
+    pub(super) fn built_in(&self, model: &ModelId) -> Option<&Calibration> {
+        self.built_in
+            .iter()
+            .find(|calibration| calibration.model() == model)
+    }
+
+    /// How far the best answer from a map of `model`, with a calibration of its `own` or none, can
+    /// be trusted. Where there is no answer, certainly none is right.
+    pub(super) fn assess(
+        &self,
+        model: &ModelId,
+        own: Option<&Calibration>,
+        best: Option<BestAnswer>,
+    ) -> MatchConfidence {
+        let Some(best) = best else {
+            return MatchConfidence {
+                matched: Some(false),
+                confidence: Some(0.0),
+            };
+        };
+        let Some(curve) = self.curve(model, own, best.spatial_score.is_some()) else {
+            return MatchConfidence::default();
+        };
+        let spatial_score = best.spatial_score.map(f64::from);
+        let global_distance = f64::from(best.global_distance);
+        let confidence = curve.weights.confidence(spatial_score, global_distance);
+        MatchConfidence {
+            matched: Some(curve.trusts(confidence)),
+            confidence: Some(confidence),
+        }
+    }
+
+    /// The curve in force: the map's own before the model's. A curve of scores holds only for the
+    /// re-ranking it was fitted on; a curve of distances holds for any.
+    fn curve<'a>(
+        &'a self,
+        model: &ModelId,
+        own: Option<&'a Calibration>,
+        reranked: bool,
+    ) -> Option<&'a ConfidenceCurve> {
+        let by_precedence = own.into_iter().chain(self.built_in(model));
+        let mut usable =
+            by_precedence.filter(|calibration| !reranked || *calibration.rerank() == self.rerank);
+        let calibration = usable.next()?;
+        Some(calibration.curve(reranked))
+    }
+
+    /// Refuses a calibration that was fitted on scores of another re-ranking than this server's.
+    pub(super) fn check(
+        &self,
+        map: &MapName,
+        calibration: &Calibration,
+    ) -> Result<(), PipelineError> {
+        if *calibration.rerank() == self.rerank {
+            return Ok(());
+        }
+        Err(PipelineError::RerankMismatch {
+            map: map.clone(),
+            server: self.rerank.clone(),
+            given: calibration.rerank().clone(),
+        })
+    }
+
+    /// Logs a warning if a map's calibration cannot be used for re-ranked answers here.
+    pub(super) fn warn_if_unusable(&self, map: &MapName, calibration: Option<&Calibration>) {
+        let Some(calibration) = calibration else {
+            return;
+        };
+        if let Err(error) = self.check(map, calibration) {
+            tracing::warn!(%map, %error, "the map's calibration is not used for re-ranked answers");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use placeformer_core::types::ConfidenceWeights;
+    use placeformer_models::built_in_calibration;
+    use placeformer_vision::extract::Head;
+    use placeformer_vision::rerank::RerankConfig;
+
+    fn curve(bias: f64, score: f64) -> ConfidenceCurve {
+        let weights = ConfidenceWeights {
+            bias,
+            score,
+            distance: -1.0,
+        };
+        ConfidenceCurve {
+            weights,
+            threshold: 0.8,
+            right: 9,
+            wrong: 5,
+            without_match: 4,
+            precision: 1.0,
+            recall: 0.9,
+            expected_calibration_error: 0.01,
+        }
+    }
+
+    fn calibration(rerank: &str, bias: f64) -> Calibration {
+        let curves = [curve(bias, 1.0), curve(bias, 0.0)];
+        Calibration::new(
+            ModelId::new("m"),
+            RerankId::new(rerank),
+            "test",
+            0.99,
+            curves,
+        )
+        .unwrap()
+    }
+
+    fn answer(spatial_score: Option<u32>, global_distance: f32) -> Option<BestAnswer> {
+        Some(BestAnswer {
+            spatial_score,
+            global_distance,
+        })
+    }
+
+    #[test]
+    fn what_ships_can_be_read_and_holds_for_the_default_re_ranking() {
+        for shipped in built_in_calibrations() {
+            assert_eq!(built_in_calibration(shipped.model()), Some(shipped.clone()));
+            assert_eq!(*shipped.rerank(), RerankConfig::default().id());
+            // Whoever makes another head must fit another calibration, or the default model goes
+            // without.
+            let parts: Vec<&str> = shipped.model().as_str().split(':').collect();
+            let head = Head::built_in(&parts[..3].join(":"))
+                .unwrap()
+                .expect("a head ships for this backbone");
+            assert_eq!(
+                *parts.last().unwrap(),
+                format!("h{}", &head.content_hash()[..12]),
+                "see `make calibration`"
+            );
+        }
+        assert_eq!(built_in_calibration(&ModelId::new("another")), None);
+    }
+
+    #[test]
+    fn the_maps_own_calibration_comes_first_and_only_where_it_holds() {
+        let calibrations = Calibrations {
+            built_in: vec![calibration("r", -3.0)],
+            rerank: RerankId::new("r"),
+        };
+        let model = &ModelId::new("m");
+        let assess_sure =
+            |own: Option<&Calibration>| calibrations.assess(model, own, answer(Some(1000), 0.2));
+        let of_model = assess_sure(None);
+        assert_eq!(of_model.matched, Some(true));
+        let unsure = calibrations.assess(model, None, answer(Some(3), 1.2));
+        assert_eq!(unsure.matched, Some(false));
+
+        let of_map = assess_sure(Some(&calibration("r", -9.0)));
+        assert!(
+            of_map.confidence < of_model.confidence && of_map.matched == Some(false),
+            "{of_map:?}"
+        );
+
+        // A calibration for another re-ranking: its distances can still be used, its scores cannot.
+        let foreign = calibration("other", -9.0);
+        assert_eq!(assess_sure(Some(&foreign)), of_model);
+        let by_distance = calibrations.assess(model, Some(&foreign), answer(None, 0.2));
+        assert!(
+            (by_distance.confidence.unwrap() - 1.0 / (1.0 + 9.2f64.exp())).abs() < 1e-6,
+            "{by_distance:?}"
+        );
+
+        // A map with a head of its own has another model, and the built-in calibration knows
+        // nothing of that model's distances.
+        let other_head = ModelId::new("other head");
+        assert_eq!(
+            calibrations.assess(&other_head, None, answer(Some(1000), 0.2)),
+            MatchConfidence::default()
+        );
+    }
+
+    #[test]
+    fn without_a_calibration_nothing_is_guessed_but_nothing_is_no_match() {
+        let model = &ModelId::new("m");
+        let calibrations = Calibrations {
+            built_in: Vec::new(),
+            rerank: RerankId::new("r"),
+        };
+        assert_eq!(
+            calibrations.assess(model, None, answer(Some(1000), 0.1)),
+            MatchConfidence::default()
+        );
+        assert_eq!(
+            calibrations.assess(model, None, None),
+            MatchConfidence {
+                matched: Some(false),
+                confidence: Some(0.0)
+            }
+        );
+        let refused = calibrations
+            .check(&"m".parse().unwrap(), &calibration("other", 0.0))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            refused.contains("\"r\"") && refused.contains("\"other\""),
+            "{refused}"
+        );
+    }
+}
