@@ -15,6 +15,10 @@ use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+// Without crash points the server would outlive what is to kill it, and the tests would prove
+// nothing.
+const _: () = assert!(crash_points::ENABLED);
+
 /// What a crash point raises.
 const SIGABRT: i32 = 6;
 const DIRECTORY: &str = "PLACEFORMER_TEST_SERVED";
