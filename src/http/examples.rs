@@ -1,5 +1,4 @@
-//! One realistic answer for every operation of the OpenAPI document, and bodies to send to those
-//! that take JSON.
+//! Realistic answers and bodies for the OpenAPI document.
 //!
 //! They follow one story: a camera drives through a harbour, and a frame of it is looked for again.
 
@@ -7,54 +6,101 @@ use serde_json::{Value, json};
 
 const ID: &str = "0197f3c2-7c1e-7d3a-9b1f-2f6f0c1d2e3f";
 const MODEL: &str = "dinov2-vits14:747267a07f39:b8:448x336:t1:k400-200-50:h0a81be38658c";
-/// A grey PNG of one pixel.
-const PIXEL: &str =
-    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg==";
+/// A grey PNG of one pixel, in base64.
+const PIXEL: &str = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK\
+    +kcQAAAABJRU5ErkJggg==";
 
-/// What an operation answers when all goes well, as JSON or as the text of another type; `None`
-/// without a body.
-pub(super) fn answer(operation_id: &str) -> Option<Value> {
-    Some(match operation_id {
-        "livez" => json!({"status": "live"}),
-        "readyz" => json!({"status": "ready", "progress": null}),
-        "metrics" => json!(
-            "# HELP placeformer_queue_depth Requests waiting for or in compute.\n\
-             # TYPE placeformer_queue_depth gauge\nplaceformer_queue_depth 3\n"
-        ),
-        "openapi_json" => {
-            json!({"openapi": "3.1.0", "info": {"title": "PlaceFormer"}, "paths": {}})
-        }
-        "info" => info(),
-        "list_maps" => json!({"maps": [map()]}),
-        "get_map" | "give_map_head" | "remove_map_head" => map(),
-        "delete_map" => json!({"references_deleted": 1204}),
-        "calibrate_map" => calibration(),
-        "create_reference" | "get_reference" | "update_reference" => reference(),
-        "list_references" => json!({"references": [reference()], "next": ID}),
-        "query" => query(),
-        "match_images" => matched(),
-        _ => return None,
-    })
+/// The answer of `/livez`.
+pub(super) fn live() -> Value {
+    json!({"status": "live"})
 }
 
-/// What readiness says while there is none.
+/// The answer of `/readyz` while requests are taken.
+pub(super) fn ready() -> Value {
+    json!({"status": "ready", "progress": null})
+}
+
+/// The answer of `/readyz` while they are not.
 pub(super) fn not_ready() -> Value {
     json!({"status": "building_index", "progress": {"done": 61_440, "total": 250_000}})
 }
 
-/// A JSON body for an operation that takes one.
-pub(super) fn body(operation_id: &str) -> Option<Value> {
-    Some(match operation_id {
-        "create_reference" => {
-            json!({"image": PIXEL, "map": "harbour", "external_id": "drive7/000123.jpg",
-            "lat": 51.5072, "lon": -0.1276, "heading": 270, "captured_at": "2026-05-17T09:30:00Z",
-            "metadata": {"camera": "left"}})
-        }
-        "update_reference" => json!({"heading": 90, "metadata": null}),
-        "query" => json!({"image": PIXEL, "map": "harbour", "top_k": 5, "deadline_ms": 2000}),
-        "match_images" => json!({"query": PIXEL, "reference": PIXEL}),
-        "calibrate_map" => calibration(),
-        _ => return None,
+/// The beginning of the metrics.
+pub(super) fn metrics() -> Value {
+    json!(
+        "# HELP placeformer_queue_depth Requests waiting for or in compute.\n\
+         # TYPE placeformer_queue_depth gauge\nplaceformer_queue_depth 3\n"
+    )
+}
+
+/// The beginning of the document itself.
+pub(super) fn openapi_json() -> Value {
+    json!({"openapi": "3.1.0", "info": {"title": "PlaceFormer"}, "paths": {}})
+}
+
+/// The answer of `/info`.
+pub(super) fn info() -> Value {
+    json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "model": MODEL,
+        "input_size": {"width": 448, "height": 336},
+        "scales": ["1", "1+2", "2+3"],
+        "calibration": calibration(),
+        "limits": {
+            "max_image_bytes": 20_971_520,
+            "top_k": 10,
+            "candidates": 100,
+            "max_candidates": 1000,
+            "deadline_ms": 30_000,
+            "max_metadata_bytes": 16_384,
+            "max_page": 1000,
+        },
+    })
+}
+
+/// A map.
+pub(super) fn map() -> Value {
+    json!({
+        "name": "harbour",
+        "model": MODEL,
+        "references": 1204,
+        "created_at": "2026-05-17T17:58:40.120934Z",
+        "calibration": null,
+    })
+}
+
+/// The list of all maps.
+pub(super) fn map_list() -> Value {
+    json!({"maps": [map()]})
+}
+
+/// The answer to the deletion of a map.
+pub(super) fn map_deleted() -> Value {
+    json!({"references_deleted": 1204})
+}
+
+/// A calibration, as it is sent and as it is stored.
+pub(super) fn calibration() -> Value {
+    let curve = |bias: f64, score: f64, distance: f64, threshold: f64| {
+        json!({
+            "weights": {"bias": bias, "score": score, "distance": distance},
+            "threshold": threshold,
+            "right": 268,
+            "wrong": 234,
+            "without_match": 219,
+            "precision": 0.991,
+            "recall": 0.76,
+            "expected_calibration_error": 0.031,
+        })
+    };
+    json!({
+        "format": 1,
+        "model": MODEL,
+        "rerank": "1,1+2,2+3:t1.5:i2000:c0.995",
+        "data": "harbour, two drives",
+        "target_precision": 0.99,
+        "reranked": curve(-1.82, 3.86, -14.45, 0.892),
+        "global": curve(17.93, 0.0, -17.45, 0.924),
     })
 }
 
@@ -62,73 +108,101 @@ fn location() -> Value {
     json!({"lat": 51.5072, "lon": -0.1276, "heading": 270.0})
 }
 
-fn reference() -> Value {
+/// A body of `POST /references`.
+pub(super) fn new_reference() -> Value {
     json!({
-        "id": ID, "map": "harbour", "external_id": "drive7/000123.jpg", "location": location(),
-        "captured_at": "2026-05-17T09:30:00Z", "metadata": {"camera": "left"},
+        "image": PIXEL,
+        "map": "harbour",
+        "external_id": "drive7/000123.jpg",
+        "lat": 51.5072,
+        "lon": -0.1276,
+        "heading": 270,
+        "captured_at": "2026-05-17T09:30:00Z",
+        "metadata": {"camera": "left"},
+    })
+}
+
+/// A body of `PATCH /references/{id}`.
+pub(super) fn reference_change() -> Value {
+    json!({"heading": 90, "metadata": null})
+}
+
+/// A stored reference.
+pub(super) fn reference() -> Value {
+    json!({
+        "id": ID,
+        "map": "harbour",
+        "external_id": "drive7/000123.jpg",
+        "location": location(),
+        "captured_at": "2026-05-17T09:30:00Z",
+        "metadata": {"camera": "left"},
         "content_sha256": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
-        "model": MODEL, "created_at": "2026-05-17T18:02:11.482193Z",
+        "model": MODEL,
+        "created_at": "2026-05-17T18:02:11.482193Z",
     })
 }
 
-fn map() -> Value {
-    json!({
-        "name": "harbour", "model": MODEL, "references": 1204, "created_at": "2026-05-17T17:58:40.120934Z",
-        "calibration": null,
-    })
+/// A page of a listing.
+pub(super) fn reference_page() -> Value {
+    json!({"references": [reference()], "next": ID})
 }
 
-fn info() -> Value {
-    json!({
-        "version": env!("CARGO_PKG_VERSION"), "model": MODEL, "input_size": {"width": 448, "height": 336},
-        "scales": ["1", "1+2", "2+3"], "calibration": calibration(),
-        "limits": {
-            "max_image_bytes": 20_971_520, "top_k": 10, "candidates": 100, "max_candidates": 1000,
-            "deadline_ms": 30_000, "max_metadata_bytes": 16_384, "max_page": 1000,
-        },
-    })
+/// A body of `/query`.
+pub(super) fn query_body() -> Value {
+    json!({"image": PIXEL, "map": "harbour", "top_k": 5, "deadline_ms": 2000})
 }
 
-fn calibration() -> Value {
-    let curve = |bias: f64, score: f64, distance: f64, threshold: f64| {
-        json!({
-            "weights": {"bias": bias, "score": score, "distance": distance}, "threshold": threshold,
-            "right": 268, "wrong": 234, "without_match": 219,
-            "precision": 0.991, "recall": 0.76, "expected_calibration_error": 0.031,
-        })
-    };
-    json!({
-        "format": 1, "model": MODEL, "rerank": "1,1+2,2+3:t1.5:i2000:c0.995", "data": "harbour, two drives",
-        "target_precision": 0.99,
-        "reranked": curve(-1.82, 3.86, -14.45, 0.892), "global": curve(17.93, 0.0, -17.45, 0.924),
-    })
-}
-
-fn query() -> Value {
+/// The answer of `/query`.
+pub(super) fn query_answer() -> Value {
     json!({
         "results": [{
-            "rank": 1, "reference_id": ID, "external_id": "drive7/000123.jpg", "location": location(),
-            "global_distance": 0.41, "spatial_score": 412,
+            "rank": 1,
+            "reference_id": ID,
+            "external_id": "drive7/000123.jpg",
+            "location": location(),
+            "global_distance": 0.41,
+            "spatial_score": 412,
             "scores": {
-                "s11": {"matches": 171, "inliers": 122}, "s12": {"matches": 236, "inliers": 178},
+                "s11": {"matches": 171, "inliers": 122},
+                "s12": {"matches": 236, "inliers": 178},
                 "s23": {"matches": 140, "inliers": 112},
             },
-            "captured_at": "2026-05-17T09:30:00Z", "metadata": {"camera": "left"},
+            "captured_at": "2026-05-17T09:30:00Z",
+            "metadata": {"camera": "left"},
         }],
-        "reranked": true, "matched": true, "confidence": 0.996,
-        "timings_ms": {"decode": 6.1, "queue": 0.4, "extract": 190.0, "search": 0.2, "load": 2.8, "rerank": 31.0},
+        "reranked": true,
+        "matched": true,
+        "confidence": 0.996,
+        "timings_ms": {
+            "decode": 6.1,
+            "queue": 0.4,
+            "extract": 190.0,
+            "search": 0.2,
+            "load": 2.8,
+            "rerank": 31.0,
+        },
         "model": MODEL,
     })
 }
 
-fn matched() -> Value {
+/// A body of `/match`.
+pub(super) fn match_body() -> Value {
+    json!({"query": PIXEL, "reference": PIXEL})
+}
+
+/// The answer of `/match`.
+pub(super) fn match_answer() -> Value {
     json!({
         "spatial_score": 122,
         "combinations": {"s11": {
-            "matches": 171, "inliers": 122,
+            "matches": 171,
+            "inliers": 122,
             "homography": [1.04, 0.01, -11.8, -0.02, 1.03, 4.6, 0.00002, -0.00001, 1.0],
             "correspondences": [{
-                "query": [105.0, 91.0], "query_scale": 1, "reference": [91.0, 91.0], "reference_scale": 1,
+                "query": [105.0, 91.0],
+                "query_scale": 1,
+                "reference": [91.0, 91.0],
+                "reference_scale": 1,
                 "inlier": true,
             }],
         }},

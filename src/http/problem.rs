@@ -1,13 +1,13 @@
 //! Every failure as RFC 9457 `application/problem+json`, from the one error table.
 //!
 //! Handlers return [`ApiError`]; its response carries the error itself as an extension and no body.
-//! The outermost layer writes the body, because only it knows the request's id; it also turns
-//! whatever else answers with an error status (the router's 404 and 405, a panic) into the same
-//! shape.
+//! The outermost layer writes the body with [`finish`], because only it knows the request's id. It
+//! also gives the same shape to whatever else answers with an error status: the router's 404 and
+//! 405, and a panic.
 
 use crate::pipeline::PipelineError;
 use axum::body::Body;
-use axum::http::{HeaderValue, StatusCode, header};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{InvalidName, InvalidValue};
@@ -26,7 +26,7 @@ pub struct ApiError {
     pub code: ErrorCode,
     /// What exactly is wrong with this request.
     pub detail: String,
-    /// When to come back, if that is known.
+    /// When to come back, if that is known better than the error table knows it.
     pub retry_after: Option<Duration>,
 }
 
@@ -65,17 +65,18 @@ impl ApiError {
         }
     }
 
-    /// A parameter is missing, unknown, of the wrong type or out of range.
+    /// `invalid_parameter`: a parameter is missing, unknown, of the wrong type or out of range.
     pub fn invalid(detail: impl Into<String>) -> Self {
         Self::new(ErrorCode::InvalidParameter, detail)
     }
 
-    /// The request cannot be parsed.
+    /// `malformed_request`: the request cannot be parsed.
     pub fn malformed(detail: impl Into<String>) -> Self {
         Self::new(ErrorCode::MalformedRequest, detail)
     }
 
-    /// Sets when to come back.
+    /// Says when to come back, where that is known better than the error table knows it. It counts
+    /// only for codes that have a `Retry-After` in the table.
     pub fn retry_after(mut self, after: Duration) -> Self {
         self.retry_after = Some(after);
         self
@@ -93,18 +94,51 @@ impl ApiError {
             retryable: self.code.retryable(),
         }
     }
+}
 
-    /// Answers that ask the client to come back say when: as known, else after a second.
-    fn retry_after_seconds(&self) -> Option<u64> {
-        let asks = matches!(self.code.status(), 429 | 503 | 504 | 507);
-        let known = self
-            .retry_after
-            .map(|after| after.as_secs_f64().ceil().max(1.0) as u64);
-        known.or(asks.then_some(if self.code == ErrorCode::DiskFull {
-            30
-        } else {
-            1
-        }))
+/// A header that the answer to an error carries, sent and documented alike.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ErrorHeader {
+    /// How many seconds to wait before sending the request again.
+    RetryAfter(u32),
+    /// How to present a key.
+    WwwAuthenticate,
+}
+
+impl ErrorHeader {
+    /// The headers of an answer with `code`, with the values of the error table.
+    pub fn of(code: ErrorCode) -> Vec<Self> {
+        let mut headers = Vec::new();
+        if let Some(seconds) = code.retry_after() {
+            headers.push(Self::RetryAfter(seconds));
+        }
+        if code == ErrorCode::Unauthorized {
+            headers.push(Self::WwwAuthenticate);
+        }
+        headers
+    }
+
+    /// Its name.
+    pub fn name(self) -> HeaderName {
+        match self {
+            Self::RetryAfter(_) => header::RETRY_AFTER,
+            Self::WwwAuthenticate => header::WWW_AUTHENTICATE,
+        }
+    }
+
+    /// Its value.
+    pub fn value(self) -> HeaderValue {
+        match self {
+            Self::RetryAfter(seconds) => HeaderValue::from(seconds),
+            Self::WwwAuthenticate => HeaderValue::from_static("Bearer"),
+        }
+    }
+}
+
+/// Sets the headers of an answer with `code`, with the values of the error table.
+pub fn set_error_headers(headers: &mut HeaderMap, code: ErrorCode) {
+    for header in ErrorHeader::of(code) {
+        headers.insert(header.name(), header.value());
     }
 }
 
@@ -141,16 +175,17 @@ impl From<InvalidName> for ApiError {
     }
 }
 
-/// The error with its causes, those left out that repeat what was said.
+/// The error with its causes. A cause whose words are already in the text is left out, because many
+/// errors repeat their source.
 fn error_chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        let said = error.to_string();
-        if !text.contains(&said) {
-            text = format!("{text}: {said}");
+    let mut source = error.source();
+    while let Some(cause) = source {
+        let words = cause.to_string();
+        if !text.contains(&words) {
+            text = format!("{text}: {words}");
         }
-        cause = error.source();
+        source = cause.source();
     }
     text
 }
@@ -172,7 +207,7 @@ fn status_of(code: ErrorCode) -> StatusCode {
 #[derive(Debug, Clone, Copy)]
 pub struct OwnBody;
 
-/// Gives an error response its body; leaves every other response alone.
+/// Gives an error response its headers and its body; leaves every other response alone.
 pub fn finish(response: Response, request_id: &str) -> Response {
     let status = response.status();
     let is_error = status.is_client_error() || status.is_server_error();
@@ -180,41 +215,38 @@ pub fn finish(response: Response, request_id: &str) -> Response {
         return response;
     }
     let (mut parts, _) = response.into_parts();
-    let error = parts
-        .extensions
-        .remove::<ApiError>()
-        .unwrap_or_else(|| of_status(status));
+    let error = match parts.extensions.remove::<ApiError>() {
+        Some(error) => error,
+        None => framework_error(status),
+    };
     parts.status = status_of(error.code);
-    if let Some(seconds) = error.retry_after_seconds() {
-        parts
-            .headers
-            .insert(header::RETRY_AFTER, HeaderValue::from(seconds));
-    }
-    if error.code == ErrorCode::Unauthorized {
-        parts
-            .headers
-            .insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
+    set_problem_headers(&mut parts.headers, &error);
+    // A struct of strings and numbers always serialises.
+    let body = serde_json::to_vec(&error.body(request_id)).unwrap_or_default();
+    Response::from_parts(parts, Body::from(body))
+}
+
+fn set_problem_headers(headers: &mut HeaderMap, error: &ApiError) {
+    set_error_headers(headers, error.code);
+    if let Some(after) = error.retry_after
+        && headers.contains_key(header::RETRY_AFTER)
+    {
+        let seconds = after.as_secs_f64().ceil().max(1.0) as u64;
+        headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds));
     }
     if matches!(
         error.code,
         ErrorCode::RequestTimeout | ErrorCode::BodyTooLarge
     ) {
         // The rest of the body is not read, so the connection cannot be used again.
-        parts
-            .headers
-            .insert(header::CONNECTION, HeaderValue::from_static("close"));
+        headers.insert(header::CONNECTION, HeaderValue::from_static("close"));
     }
-    parts.headers.remove(header::CONTENT_LENGTH);
-    parts
-        .headers
-        .insert(header::CONTENT_TYPE, HeaderValue::from_static(PROBLEM_JSON));
-    // A struct of strings and numbers always serialises.
-    let body = serde_json::to_vec(&error.body(request_id)).unwrap_or_default();
-    Response::from_parts(parts, Body::from(body))
+    headers.remove(header::CONTENT_LENGTH);
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(PROBLEM_JSON));
 }
 
-/// An error that the framework answered by itself.
-fn of_status(status: StatusCode) -> ApiError {
+/// The error for a status that the framework answered by itself.
+fn framework_error(status: StatusCode) -> ApiError {
     match status {
         StatusCode::NOT_FOUND => ApiError::new(
             ErrorCode::RouteNotFound,
@@ -239,5 +271,33 @@ fn of_status(status: StatusCode) -> ApiError {
             ApiError::malformed("the request cannot be understood")
         }
         _ => ApiError::new(ErrorCode::Internal, "the server failed"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_error_asks_to_come_back_exactly_if_the_table_says_so() {
+        for &code in ErrorCode::ALL {
+            let response = finish(ApiError::new(code, "x").into_response(), "id");
+            let sent = response.headers().get(header::RETRY_AFTER);
+            let seconds = sent.map(|value| value.to_str().unwrap().parse().unwrap());
+            assert_eq!(seconds, code.retry_after(), "{}", code.as_str());
+        }
+    }
+
+    #[test]
+    fn a_time_known_better_replaces_that_of_the_table() {
+        let header_of = |code, milliseconds| {
+            let after = Duration::from_millis(milliseconds);
+            let error = ApiError::new(code, "x").retry_after(after);
+            let response = finish(error.into_response(), "id");
+            response.headers().get(header::RETRY_AFTER).cloned()
+        };
+        assert_eq!(header_of(ErrorCode::Overloaded, 2001).unwrap(), "3");
+        assert_eq!(header_of(ErrorCode::RateLimited, 2).unwrap(), "1");
+        assert_eq!(header_of(ErrorCode::MapNotFound, 2001), None);
     }
 }

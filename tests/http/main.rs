@@ -17,4 +17,5 @@ mod killed;
 mod logs;
 mod process;
 mod rehead;
+mod routes;
 mod surface;

@@ -1,8 +1,8 @@
 //! `/info`: what this server runs.
 
 use super::match_images::SizeBody;
-use crate::http::AppState;
 use crate::http::problem::ApiError;
+use crate::http::state::AppState;
 use axum::Json;
 use axum::extract::State;
 use placeformer_core::types::Calibration;
@@ -52,9 +52,13 @@ pub struct LimitsBody {
 /// What this server runs
 ///
 /// Its version, its model, and the bounds of requests.
-#[utoipa::path(get, path = "/info", operation_id = "info", tag = "service", responses(
-    (status = 200, description = "Version, model and bounds.", body = InfoBody),
-))]
+#[utoipa::path(
+    get,
+    path = "/info",
+    operation_id = "info",
+    tag = "service",
+    responses((status = 200, description = "Version, model and bounds.", body = InfoBody)),
+)]
 pub async fn info(State(state): State<AppState>) -> Result<Json<InfoBody>, ApiError> {
     let info = state.service()?.info();
     Ok(Json(InfoBody {

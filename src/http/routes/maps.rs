@@ -1,8 +1,8 @@
 //! `/maps`: sets of references that are searched together.
 
-use crate::http::AppState;
 use crate::http::body::{read_file, read_json};
 use crate::http::problem::ApiError;
+use crate::http::state::AppState;
 use axum::Json;
 use axum::extract::{Path, Request, State};
 use axum::http::StatusCode;
@@ -13,8 +13,8 @@ use serde::Serialize;
 use time::OffsetDateTime;
 use utoipa::ToSchema;
 
-/// Largest head: a VLAD of 80 words of ViT-S tokens, or of 20 of ViT-L tokens.
-const MAX_HEAD_BYTES: usize = 32 << 20;
+/// Largest file of a head in bytes: a VLAD of 80 words of ViT-S tokens, or of 20 of ViT-L tokens.
+pub const MAX_HEAD_BYTES: usize = 32 << 20;
 
 /// A map.
 #[derive(Debug, Serialize, ToSchema)]
@@ -63,9 +63,15 @@ pub struct MapDeleted {
 /// List maps
 ///
 /// All of them, by name.
-#[utoipa::path(get, path = "/maps", operation_id = "list_maps", tag = "maps", responses(
-    (status = 200, description = "All maps.", body = MapList),
-))]
+#[utoipa::path(
+    get,
+    path = "/maps",
+    operation_id = "list_maps",
+    tag = "maps",
+    responses(
+        (status = 200, description = "All maps.", body = MapList),
+    ),
+)]
 pub async fn list(State(state): State<AppState>) -> Result<Json<MapList>, ApiError> {
     let maps = state.service()?.maps().await?;
     Ok(Json(MapList {
@@ -85,24 +91,37 @@ fn parse_name(text: &str) -> Result<MapName, ApiError> {
 /// One map
 ///
 /// With the model it is bound to and its size.
-#[utoipa::path(get, path = "/maps/{map}", operation_id = "get_map", tag = "maps",
-    params(("map" = String, Path, description = "The map's name.")), responses(
-    (status = 200, description = "The map.", body = MapBody),
-))]
+#[utoipa::path(
+    get,
+    path = "/maps/{map}",
+    operation_id = "get_map",
+    tag = "maps",
+    params(("map" = String, Path, description = "The map's name.")),
+    responses(
+        (status = 200, description = "The map.", body = MapBody),
+    ),
+)]
 pub async fn get(
     State(state): State<AppState>,
     Path(map): Path<String>,
 ) -> Result<Json<MapBody>, ApiError> {
-    Ok(Json(state.service()?.map(parse_name(&map)?).await?.into()))
+    let info = state.service()?.map(parse_name(&map)?).await?;
+    Ok(Json(info.into()))
 }
 
 /// Delete a map
 ///
 /// With every reference in it.
-#[utoipa::path(delete, path = "/maps/{map}", operation_id = "delete_map", tag = "maps",
-    params(("map" = String, Path, description = "The map's name.")), responses(
-    (status = 200, description = "It is gone.", body = MapDeleted),
-))]
+#[utoipa::path(
+    delete,
+    path = "/maps/{map}",
+    operation_id = "delete_map",
+    tag = "maps",
+    params(("map" = String, Path, description = "The map's name.")),
+    responses(
+        (status = 200, description = "It is gone.", body = MapDeleted),
+    ),
+)]
 pub async fn delete(
     State(state): State<AppState>,
     Path(map): Path<String>,
@@ -116,11 +135,18 @@ pub async fn delete(
 /// From the next query on, `matched` and `confidence` come from this. `placeformer eval calibrate`
 /// fits it. It must have been fitted for the map's model and this server's re-ranking, else the
 /// answer is 409 with both identities.
-#[utoipa::path(put, path = "/maps/{map}/calibration", operation_id = "calibrate_map", tag = "maps", request_body = Calibration,
-    params(("map" = String, Path, description = "The map's name.")), responses(
-    (status = 200, description = "The calibration as it is stored.", body = Calibration),
-))]
-pub async fn calibrate(
+#[utoipa::path(
+    put,
+    path = "/maps/{map}/calibration",
+    operation_id = "calibrate_map",
+    tag = "maps",
+    request_body = Calibration,
+    params(("map" = String, Path, description = "The map's name.")),
+    responses(
+        (status = 200, description = "The calibration as it is stored.", body = Calibration),
+    ),
+)]
+pub async fn set_calibration(
     State(state): State<AppState>,
     Path(map): Path<String>,
     request: Request,
@@ -136,11 +162,17 @@ pub async fn calibrate(
 /// Remove a map's calibration
 ///
 /// The model's own is in force again, if it has one.
-#[utoipa::path(delete, path = "/maps/{map}/calibration", operation_id = "uncalibrate_map", tag = "maps",
-    params(("map" = String, Path, description = "The map's name.")), responses(
-    (status = 204, description = "The map has no calibration of its own."),
-))]
-pub async fn uncalibrate(
+#[utoipa::path(
+    delete,
+    path = "/maps/{map}/calibration",
+    operation_id = "uncalibrate_map",
+    tag = "maps",
+    params(("map" = String, Path, description = "The map's name.")),
+    responses(
+        (status = 204, description = "The map has no calibration of its own."),
+    ),
+)]
+pub async fn remove_calibration(
     State(state): State<AppState>,
     Path(map): Path<String>,
 ) -> Result<StatusCode, ApiError> {
@@ -162,38 +194,48 @@ pub async fn uncalibrate(
 ///
 /// A head made for another backbone or another pooling of tokens is refused with both identities
 /// (409). One head can be given at a time (503).
-#[utoipa::path(put, path = "/maps/{map}/head", operation_id = "give_map_head", tag = "maps",
+#[utoipa::path(
+    put,
+    path = "/maps/{map}/head",
+    operation_id = "give_map_head",
+    tag = "maps",
     request_body(content = String, content_type = "application/octet-stream"),
-    params(("map" = String, Path, description = "The map's name.")), responses(
-    (status = 200, description = "The map with its new model.", body = MapBody),
-))]
-pub async fn rehead(
+    params(("map" = String, Path, description = "The map's name.")),
+    responses(
+        (status = 200, description = "The map with its new model.", body = MapBody),
+    ),
+)]
+pub async fn set_head(
     State(state): State<AppState>,
     Path(map): Path<String>,
     request: Request,
 ) -> Result<Json<MapBody>, ApiError> {
-    let (service, map) = (state.service()?, parse_name(&map)?);
+    let service = state.service()?;
+    let map = parse_name(&map)?;
     let file = read_file(&state, request, MAX_HEAD_BYTES).await?;
-    Ok(Json(service.set_head(map, Some(file)).await?.into()))
+    let info = service.set_head(map, Some(file)).await?;
+    Ok(Json(info.into()))
 }
 
 /// Give a map the server's head
 ///
 /// As with `PUT`, but with the head that the server itself runs, which the map then goes along
 /// with. This is also how a map made by a server with another head is brought over to this one.
-#[utoipa::path(delete, path = "/maps/{map}/head", operation_id = "remove_map_head", tag = "maps",
-    params(("map" = String, Path, description = "The map's name.")), responses(
-    (status = 200, description = "The map with the server's model.", body = MapBody),
-))]
-pub async fn unhead(
+#[utoipa::path(
+    delete,
+    path = "/maps/{map}/head",
+    operation_id = "remove_map_head",
+    tag = "maps",
+    params(("map" = String, Path, description = "The map's name.")),
+    responses(
+        (status = 200, description = "The map with the server's model.", body = MapBody),
+    ),
+)]
+pub async fn remove_head(
     State(state): State<AppState>,
     Path(map): Path<String>,
 ) -> Result<Json<MapBody>, ApiError> {
-    Ok(Json(
-        state
-            .service()?
-            .set_head(parse_name(&map)?, None)
-            .await?
-            .into(),
-    ))
+    let service = state.service()?;
+    let info = service.set_head(parse_name(&map)?, None).await?;
+    Ok(Json(info.into()))
 }

@@ -1,9 +1,10 @@
 //! `/match`: the evidence that two images show the same place.
 
 use super::shapes::{timed, timings_ms};
-use crate::http::AppState;
-use crate::http::body::read_upload;
+use crate::http::body::{ImageUpload, read_upload};
+use crate::http::examples;
 use crate::http::problem::ApiError;
+use crate::http::state::AppState;
 use crate::pipeline::{MatchSide, Matched};
 use axum::extract::{Request, State};
 use axum::response::Response;
@@ -11,7 +12,15 @@ use placeformer_core::types::ReferenceId;
 use placeformer_vision::rerank::CombinationMatch;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use utoipa::{IntoParams, ToSchema};
+use utoipa::{IntoParams, PartialSchema, ToSchema};
+
+/// What the body of a match consists of.
+pub static UPLOAD: ImageUpload = ImageUpload {
+    images: &["query", "reference"],
+    required_parameters: &[],
+    parameters: MatchParams::schema,
+    example: examples::match_body,
+};
 
 /// What to match the query image against.
 #[derive(Debug, Default, Deserialize, IntoParams, ToSchema)]
@@ -26,6 +35,9 @@ pub struct MatchParams {
 
 impl MatchParams {
     /// Checks what the types cannot.
+    ///
+    /// # Errors
+    /// `invalid_parameter` if the id is not one.
     pub fn checked(self) -> Result<Option<ReferenceId>, ApiError> {
         Ok(self.reference_id.as_deref().map(str::parse).transpose()?)
     }
@@ -92,15 +104,27 @@ pub struct CorrespondenceBody {
 ///
 /// Send the images as the multipart parts `query` and `reference`, as base64 in JSON under the same
 /// names, or the query as the raw body with `reference_id`.
-#[utoipa::path(post, path = "/match", operation_id = "match_images", tag = "query", params(MatchParams), responses(
-    (status = 200, description = "The correspondences and homographies.", body = MatchAnswerBody),
-))]
+#[utoipa::path(
+    post,
+    path = "/match",
+    operation_id = "match_images",
+    tag = "query",
+    params(MatchParams),
+    responses(
+        (
+            status = 200,
+            description = "The correspondences and homographies.",
+            body = MatchAnswerBody,
+            headers(("server-timing" = String, description = "Milliseconds per stage.")),
+        ),
+    ),
+)]
 pub async fn match_images(
     State(state): State<AppState>,
     request: Request,
 ) -> Result<Response, ApiError> {
     let service = state.service()?;
-    let mut upload = read_upload::<MatchParams>(&state, request, &["query", "reference"]).await?;
+    let mut upload = read_upload::<MatchParams>(&state, request, &UPLOAD).await?;
     let query = upload.take("query")?;
     let reference_id = std::mem::take(&mut upload.params).checked()?;
     let other = match (upload.take_optional("reference")?, reference_id) {
@@ -113,14 +137,16 @@ pub async fn match_images(
         }
     };
     let answer = service.match_images(query, other).await?;
-    let pair = &answer.matched;
+    let mut spatial_score = 0;
+    let mut combinations = BTreeMap::new();
+    for combination in &answer.matched.combinations {
+        spatial_score += combination.score.inliers;
+        let name = combination.score.scales.score_name();
+        combinations.insert(name, combination_body(&answer.matched, combination));
+    }
     let body = MatchAnswerBody {
-        spatial_score: pair.combinations.iter().map(|one| one.score.inliers).sum(),
-        combinations: pair
-            .combinations
-            .iter()
-            .map(|one| named(pair, one))
-            .collect(),
+        spatial_score,
+        combinations,
         input_size: SizeBody {
             width: answer.input_size.width,
             height: answer.input_size.height,
@@ -131,22 +157,23 @@ pub async fn match_images(
     Ok(timed(body, &answer.timings))
 }
 
-fn named(pair: &Matched, one: &CombinationMatch) -> (String, CombinationMatchBody) {
-    let correspondences = one.correspondences.iter().map(|c| {
-        let (query, reference) = (c.query as usize, c.reference as usize);
-        CorrespondenceBody {
+fn combination_body(pair: &Matched, combination: &CombinationMatch) -> CombinationMatchBody {
+    let mut correspondences = Vec::with_capacity(combination.correspondences.len());
+    for correspondence in &combination.correspondences {
+        let query = correspondence.query as usize;
+        let reference = correspondence.reference as usize;
+        correspondences.push(CorrespondenceBody {
             query: pair.query.centre(query),
             query_scale: pair.query.scale_of(query),
             reference: pair.reference.centre(reference),
             reference_scale: pair.reference.scale_of(reference),
-            inlier: c.inlier,
-        }
-    });
-    let body = CombinationMatchBody {
-        matches: one.score.matches,
-        inliers: one.score.inliers,
-        homography: one.homography.map(|h| h.to_vec()),
-        correspondences: correspondences.collect(),
-    };
-    (one.score.scales.score_name(), body)
+            inlier: correspondence.inlier,
+        });
+    }
+    CombinationMatchBody {
+        matches: combination.score.matches,
+        inliers: combination.score.inliers,
+        homography: combination.homography.map(|matrix| matrix.to_vec()),
+        correspondences,
+    }
 }

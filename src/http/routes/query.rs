@@ -1,9 +1,10 @@
 //! `/query`: which place does this photo show?
 
 use super::shapes::{LocationBody, location, timed, timings_ms};
-use crate::http::AppState;
-use crate::http::body::read_upload;
+use crate::http::body::{ImageUpload, read_upload};
+use crate::http::examples;
 use crate::http::problem::ApiError;
+use crate::http::state::AppState;
 use crate::pipeline::{QueryAnswer, QueryOptions, QueryRequest, QueryResult};
 use axum::extract::{Request, State};
 use axum::response::Response;
@@ -12,9 +13,17 @@ use placeformer_vision::rerank::PairScore;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use time::OffsetDateTime;
-use utoipa::{IntoParams, ToSchema};
+use utoipa::{IntoParams, PartialSchema, ToSchema};
+
+/// What the body of a query consists of.
+pub static UPLOAD: ImageUpload = ImageUpload {
+    images: &["image"],
+    required_parameters: &["map"],
+    parameters: QueryParams::schema,
+    example: examples::query_body,
+};
 
 /// Where to look, how hard, and how long.
 #[derive(Debug, Default, Deserialize, IntoParams, ToSchema)]
@@ -23,7 +32,11 @@ use utoipa::{IntoParams, ToSchema};
 pub struct QueryParams {
     /// The map to look in. Required here or in the JSON.
     #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", value_type = Option<String>)]
-    #[param(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", value_type = Option<String>, example = "harbour")]
+    #[param(
+        pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
+        value_type = Option<String>,
+        example = "harbour",
+    )]
     #[serde(default)]
     pub map: Option<MapName>,
     /// Results wanted; 10 unless configured otherwise.
@@ -65,15 +78,17 @@ pub struct QueryParams {
 pub struct CheckedQuery {
     /// The map to look in.
     pub map: MapName,
-    /// How to answer, but for the deadline.
+    /// How to answer; the deadline is still missing.
     pub options: QueryOptions,
     /// Time for the answer, if the client says.
     pub budget: Option<Duration>,
 }
 
 impl QueryParams {
-    /// Checks what the types cannot; the counts are checked by the pipeline, which knows their
-    /// bounds.
+    /// Checks what the types cannot. The counts are left to the pipeline, which knows their bounds.
+    ///
+    /// # Errors
+    /// `invalid_parameter` with the name of the parameter.
     pub fn checked(self) -> Result<CheckedQuery, ApiError> {
         let filter = ReferenceFilter {
             near: self.near()?,
@@ -83,15 +98,15 @@ impl QueryParams {
         if self.deadline_ms == Some(0) {
             return Err(ApiError::invalid("deadline_ms: it must be at least 1"));
         }
-        let (top_k, candidates, rerank) = (self.top_k, self.candidates, self.rerank);
+        let map = self
+            .map
+            .ok_or_else(|| ApiError::invalid("map: it is required"))?;
         Ok(CheckedQuery {
-            map: self
-                .map
-                .ok_or_else(|| ApiError::invalid("map: it is required"))?,
+            map,
             options: QueryOptions {
-                top_k,
-                candidates,
-                rerank,
+                top_k: self.top_k,
+                candidates: self.candidates,
+                rerank: self.rerank,
                 filter,
                 deadline: None,
             },
@@ -136,7 +151,10 @@ pub struct QueryAnswerBody {
     #[schema(minimum = 0, maximum = 1, example = 0.97)]
     pub confidence: Option<f64>,
     /// Milliseconds per stage, as in the `Server-Timing` header.
-    #[schema(value_type = std::collections::HashMap<String, f64>, example = json!({"decode": 6.1, "extract": 210.0, "rerank": 44.9}))]
+    #[schema(
+        value_type = std::collections::HashMap<String, f64>,
+        example = json!({"decode": 6.1, "extract": 210.0, "rerank": 44.9}),
+    )]
     pub timings_ms: BTreeMap<&'static str, f64>,
     /// The model that computed it.
     pub model: String,
@@ -159,7 +177,9 @@ pub struct QueryResultBody {
     /// S, the number of inliers over all scale combinations; null if this result was not re-ranked.
     pub spatial_score: Option<u32>,
     /// S by scale combination; null if this result was not re-ranked.
-    #[schema(example = json!({"s11": {"matches": 96, "inliers": 41}, "s12": {"matches": 130, "inliers": 60}}))]
+    #[schema(example = json!({
+        "s11": {"matches": 96, "inliers": 41}, "s12": {"matches": 130, "inliers": 60},
+    }))]
     pub scores: Option<BTreeMap<String, CombinationBody>>,
     /// When it was taken.
     #[serde(with = "time::serde::rfc3339::option")]
@@ -195,55 +215,68 @@ impl QueryResultBody {
 }
 
 fn scores(score: &PairScore) -> BTreeMap<String, CombinationBody> {
-    let body = |inliers, matches| CombinationBody { matches, inliers };
-    score
-        .combinations
-        .iter()
-        .map(|one| (one.scales.score_name(), body(one.inliers, one.matches)))
-        .collect()
+    let mut bodies = BTreeMap::new();
+    for combination in &score.combinations {
+        let body = CombinationBody {
+            matches: combination.matches,
+            inliers: combination.inliers,
+        };
+        bodies.insert(combination.scales.score_name(), body);
+    }
+    bodies
 }
 
 /// Find the places a photo may show
 ///
 /// The image is the raw body with the options as query parameters, or a multipart part `image`
 /// beside a part `json`, or base64 in JSON beside the options.
-#[utoipa::path(post, path = "/query", operation_id = "query", tag = "query", params(QueryParams), responses(
-    (status = 200, description = "The ranked places; none if the map, or what the filter leaves of it, is empty.",
-        body = QueryAnswerBody, headers(("server-timing" = String, description = "Milliseconds per stage."))),
-))]
+#[utoipa::path(
+    post,
+    path = "/query",
+    operation_id = "query",
+    tag = "query",
+    params(QueryParams),
+    responses(
+        (
+            status = 200,
+            description = "The ranked places; none if the map, or what the filter leaves of it, \
+                is empty.",
+            body = QueryAnswerBody,
+            headers(("server-timing" = String, description = "Milliseconds per stage.")),
+        ),
+    ),
+)]
 pub async fn query(State(state): State<AppState>, request: Request) -> Result<Response, ApiError> {
-    let arrived = std::time::Instant::now();
+    let arrived = Instant::now();
     let service = state.service()?;
-    let mut upload = read_upload::<QueryParams>(&state, request, &["image"]).await?;
+    let mut upload = read_upload::<QueryParams>(&state, request, &UPLOAD).await?;
     let image = upload.take("image")?;
     let CheckedQuery {
         map,
         mut options,
         budget,
     } = std::mem::take(&mut upload.params).checked()?;
-    let most = Duration::from_millis(service.config().deadline_ms);
-    options.deadline = Some(Deadline::after(
-        budget
-            .unwrap_or(most)
-            .min(most)
-            .saturating_sub(arrived.elapsed()),
-    ));
-    let answer = service
-        .query(QueryRequest {
-            map,
-            image,
-            options,
-        })
-        .await?;
+    let longest = Duration::from_millis(service.config().deadline_ms);
+    let budget = budget.unwrap_or(longest).min(longest);
+    // The time that the body took to arrive is part of the budget.
+    let time_left = budget.saturating_sub(arrived.elapsed());
+    options.deadline = Some(Deadline::after(time_left));
+    let query = QueryRequest {
+        map,
+        image,
+        options,
+    };
+    let answer = service.query(query).await?;
     Ok(respond(answer))
 }
 
 fn respond(answer: QueryAnswer) -> Response {
-    let results = answer.results.into_iter().enumerate();
+    let mut results = Vec::with_capacity(answer.results.len());
+    for (position, result) in answer.results.into_iter().enumerate() {
+        results.push(QueryResultBody::new(position, result));
+    }
     let body = QueryAnswerBody {
-        results: results
-            .map(|(position, result)| QueryResultBody::new(position, result))
-            .collect(),
+        results,
         reranked: answer.reranked,
         matched: answer.verdict.matched,
         confidence: answer.verdict.confidence,

@@ -1,9 +1,10 @@
 //! `/references`: the photos that make up the maps.
 
 use super::shapes::{ReferenceBody, json_object, point, present, timed};
-use crate::http::AppState;
-use crate::http::body::{read_json, read_query, read_upload};
+use crate::http::body::{ImageUpload, read_json, read_query, read_upload};
+use crate::http::examples;
 use crate::http::problem::ApiError;
+use crate::http::state::AppState;
 use crate::pipeline::IngestRequest;
 use axum::Json;
 use axum::extract::{Path, Request, State};
@@ -15,7 +16,15 @@ use placeformer_store::ReferencePatch;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use time::OffsetDateTime;
-use utoipa::{IntoParams, ToSchema};
+use utoipa::{IntoParams, PartialSchema, ToSchema};
+
+/// What the body of a new reference consists of.
+pub static UPLOAD: ImageUpload = ImageUpload {
+    images: &["image"],
+    required_parameters: &["map"],
+    parameters: ReferenceParams::schema,
+    example: examples::new_reference,
+};
 
 /// References in a page when the client does not say.
 const DEFAULT_PAGE: usize = 100;
@@ -27,13 +36,22 @@ const DEFAULT_PAGE: usize = 100;
 pub struct ReferenceParams {
     /// The map, created on first use: 1 to 64 of `A-Z a-z 0-9 . _ -`. Required here or in the JSON.
     #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", value_type = Option<String>)]
-    #[param(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", value_type = Option<String>, example = "harbour")]
+    #[param(
+        pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
+        value_type = Option<String>,
+        example = "harbour",
+    )]
     #[serde(default)]
     pub map: Option<MapName>,
     /// Your own name for the photo, unique in the map. Sending the same photo under it again
     /// changes nothing.
     #[schema(min_length = 1, max_length = 256, value_type = Option<String>)]
-    #[param(min_length = 1, max_length = 256, value_type = Option<String>, example = "drive7/000123.jpg")]
+    #[param(
+        min_length = 1,
+        max_length = 256,
+        value_type = Option<String>,
+        example = "drive7/000123.jpg",
+    )]
     #[serde(default)]
     pub external_id: Option<ExternalId>,
     /// Latitude in degrees (WGS84); with `lon` or not at all.
@@ -50,7 +68,11 @@ pub struct ReferenceParams {
     pub heading: Option<f64>,
     /// When the photo was taken (RFC 3339).
     #[schema(value_type = Option<String>, format = DateTime)]
-    #[param(value_type = Option<String>, format = DateTime, example = "2026-05-17T09:30:00Z")]
+    #[param(
+        value_type = Option<String>,
+        format = DateTime,
+        example = "2026-05-17T09:30:00Z",
+    )]
     #[serde(default, with = "time::serde::rfc3339::option")]
     pub captured_at: Option<OffsetDateTime>,
     /// Anything else, as a JSON object; returned as it came.
@@ -62,6 +84,9 @@ pub struct ReferenceParams {
 
 impl ReferenceParams {
     /// Checks what the types cannot.
+    ///
+    /// # Errors
+    /// `invalid_parameter` with the name of the parameter.
     pub fn checked(self) -> Result<(MapName, ReferenceFields), ApiError> {
         let map = self
             .map
@@ -82,16 +107,38 @@ impl ReferenceParams {
 /// Acknowledged only after it is durable and can be found. The image is the raw body with the
 /// fields as query parameters, or a multipart part `image` beside a part `json`, or base64 in JSON
 /// beside the fields.
-#[utoipa::path(post, path = "/references", operation_id = "create_reference", tag = "references", params(ReferenceParams), responses(
-    (status = 201, description = "It is new, durable and can be found.", body = ReferenceBody,
-        headers(("location" = String, description = "Its path."))),
-    (status = 200, description = "The same photo was there before under this external id.", body = ReferenceBody),
-))]
+#[utoipa::path(
+    post,
+    path = "/references",
+    operation_id = "create_reference",
+    tag = "references",
+    params(ReferenceParams),
+    responses(
+        (
+            status = 201,
+            description = "It is new, durable and can be found.",
+            body = ReferenceBody,
+            headers(
+                ("location" = String, description = "Its path."),
+                ("server-timing" = String, description = "Milliseconds per stage."),
+            ),
+        ),
+        (
+            status = 200,
+            description = "The same photo was there before under this external id.",
+            body = ReferenceBody,
+            headers(
+                ("location" = String, description = "Its path."),
+                ("server-timing" = String, description = "Milliseconds per stage."),
+            ),
+        ),
+    ),
+)]
 pub async fn create(State(state): State<AppState>, request: Request) -> Result<Response, ApiError> {
     let service = state.service()?;
-    // Before the body is read: who cannot be served need not send it.
+    // A client whose photo cannot be stored now learns so before it sends the photo.
     service.may_store()?;
-    let mut upload = read_upload::<ReferenceParams>(&state, request, &["image"]).await?;
+    let mut upload = read_upload::<ReferenceParams>(&state, request, &UPLOAD).await?;
     let image = upload.take("image")?;
     let (map, fields) = std::mem::take(&mut upload.params).checked()?;
     let answer = service.ingest(IngestRequest { map, fields, image }).await?;
@@ -127,7 +174,7 @@ pub struct ListParams {
     limit: Option<usize>,
 }
 
-/// What a listing asks for, each in its range.
+/// What a listing asks for, every value in its range.
 #[derive(Debug, PartialEq)]
 pub enum Listing {
     /// The one reference with this external id.
@@ -145,6 +192,9 @@ pub enum Listing {
 
 impl ListParams {
     /// Checks what the types cannot; a page has at most `max_page` references.
+    ///
+    /// # Errors
+    /// `invalid_parameter` with the name of the parameter.
     pub fn checked(self, max_page: usize) -> Result<Listing, ApiError> {
         let limit = self.limit.unwrap_or(DEFAULT_PAGE.min(max_page));
         if !(1..=max_page).contains(&limit) {
@@ -173,56 +223,69 @@ pub struct ReferencePage {
 /// List references
 ///
 /// In the order they were added, page by page.
-#[utoipa::path(get, path = "/references", operation_id = "list_references", tag = "references", params(ListParams), responses(
-    (status = 200, description = "A page.", body = ReferencePage),
-))]
+#[utoipa::path(
+    get,
+    path = "/references",
+    operation_id = "list_references",
+    tag = "references",
+    params(ListParams),
+    responses(
+        (status = 200, description = "A page.", body = ReferencePage),
+    ),
+)]
 pub async fn list(
     State(state): State<AppState>,
     uri: Uri,
 ) -> Result<Json<ReferencePage>, ApiError> {
     let listing = read_query::<ListParams>(&uri)?.checked(state.http.max_page)?;
     let service = state.service()?;
-    let (map, after, limit) = match listing {
+    let page = match listing {
         Listing::Named(map, external_id) => {
             let found = service.find_external(map, external_id).await?;
-            return Ok(Json(ReferencePage {
+            ReferencePage {
                 references: found.into_iter().map(Into::into).collect(),
                 next: None,
-            }));
+            }
         }
-        Listing::Page { map, after, limit } => (map, after, limit),
+        Listing::Page { map, after, limit } => {
+            let page = service.references(map, after, limit).await?;
+            ReferencePage {
+                references: page.references.into_iter().map(Into::into).collect(),
+                next: page.next.map(|id| id.to_string()),
+            }
+        }
     };
-    let page = service.references(map, after, limit).await?;
-    Ok(Json(ReferencePage {
-        references: page.references.into_iter().map(Into::into).collect(),
-        next: page.next.map(|id| id.to_string()),
-    }))
+    Ok(Json(page))
 }
 
 fn parse_id(text: &str) -> Result<ReferenceId, ApiError> {
-    let absent = |_| {
+    text.parse().map_err(|_| {
         ApiError::new(
             ErrorCode::ReferenceNotFound,
             "the id in the path is not a UUID, so nothing has it",
         )
-    };
-    text.parse().map_err(absent)
+    })
 }
 
 /// One reference
 ///
 /// Its metadata; the image itself is not kept.
-#[utoipa::path(get, path = "/references/{id}", operation_id = "get_reference", tag = "references",
-    params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
-    (status = 200, description = "The reference.", body = ReferenceBody),
-))]
+#[utoipa::path(
+    get,
+    path = "/references/{id}",
+    operation_id = "get_reference",
+    tag = "references",
+    params(("id" = String, Path, description = "The reference's id.", format = Uuid)),
+    responses(
+        (status = 200, description = "The reference.", body = ReferenceBody),
+    ),
+)]
 pub async fn get(
     State(state): State<AppState>,
     Path(id): Path<String>,
 ) -> Result<Json<ReferenceBody>, ApiError> {
-    Ok(Json(
-        state.service()?.reference(parse_id(&id)?).await?.into(),
-    ))
+    let reference = state.service()?.reference(parse_id(&id)?).await?;
+    Ok(Json(reference.into()))
 }
 
 /// Fields to change: one left out stays as it is, null clears it.
@@ -270,13 +333,15 @@ impl ReferenceChange {
                 ));
             }
         };
+        let heading = match self.heading {
+            None => None,
+            Some(None) => Some(None),
+            Some(Some(degrees)) => Some(Some(Heading::new(degrees)?)),
+        };
         Ok(ReferencePatch {
             external_id: self.external_id,
             location,
-            heading: self
-                .heading
-                .map(|heading| heading.map(Heading::new).transpose())
-                .transpose()?,
+            heading,
             captured_at: self.captured_at.map(|at| at.map(|Rfc3339(at)| at)),
             metadata: self.metadata,
         })
@@ -286,10 +351,17 @@ impl ReferenceChange {
 /// Change a reference's metadata
 ///
 /// The photo and what was computed from it stay. A new position is used by the next query.
-#[utoipa::path(patch, path = "/references/{id}", operation_id = "update_reference", tag = "references", request_body = ReferenceChange,
-    params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
-    (status = 200, description = "The reference as it is now.", body = ReferenceBody),
-))]
+#[utoipa::path(
+    patch,
+    path = "/references/{id}",
+    operation_id = "update_reference",
+    tag = "references",
+    request_body = ReferenceChange,
+    params(("id" = String, Path, description = "The reference's id.", format = Uuid)),
+    responses(
+        (status = 200, description = "The reference as it is now.", body = ReferenceBody),
+    ),
+)]
 pub async fn update(
     State(state): State<AppState>,
     Path(id): Path<String>,
@@ -297,18 +369,23 @@ pub async fn update(
 ) -> Result<Json<ReferenceBody>, ApiError> {
     let id = parse_id(&id)?;
     let change: ReferenceChange = read_json(&state, request).await?;
-    Ok(Json(
-        state.service()?.update(id, change.checked()?).await?.into(),
-    ))
+    let reference = state.service()?.update(id, change.checked()?).await?;
+    Ok(Json(reference.into()))
 }
 
 /// Delete a reference
 ///
 /// It is found by no query that begins after the answer.
-#[utoipa::path(delete, path = "/references/{id}", operation_id = "delete_reference", tag = "references",
-    params(("id" = String, Path, description = "The reference's id.", format = Uuid)), responses(
-    (status = 204, description = "It is gone."),
-))]
+#[utoipa::path(
+    delete,
+    path = "/references/{id}",
+    operation_id = "delete_reference",
+    tag = "references",
+    params(("id" = String, Path, description = "The reference's id.", format = Uuid)),
+    responses(
+        (status = 204, description = "It is gone."),
+    ),
+)]
 pub async fn delete(
     State(state): State<AppState>,
     Path(id): Path<String>,

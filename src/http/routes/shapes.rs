@@ -74,15 +74,22 @@ impl From<Reference> for ReferenceBody {
 
 /// Location and heading of a reference, if it has either.
 pub fn location(reference: &Reference) -> Option<LocationBody> {
-    let (point, heading) = (reference.fields.location, reference.fields.heading);
-    (point.is_some() || heading.is_some()).then(|| LocationBody {
+    let point = reference.fields.location;
+    let heading = reference.fields.heading;
+    if point.is_none() && heading.is_none() {
+        return None;
+    }
+    Some(LocationBody {
         lat: point.map(GeoPoint::lat),
         lon: point.map(GeoPoint::lon),
         heading: heading.map(Heading::degrees),
     })
 }
 
-/// A position from its two halves, of which neither may miss alone.
+/// A position from its two coordinates, which are given together or not at all.
+///
+/// # Errors
+/// `invalid_parameter` for one without the other, and for a value out of range.
 pub fn point(lat: Option<f64>, lon: Option<f64>) -> Result<Option<GeoPoint>, ApiError> {
     match (lat, lon) {
         (Some(lat), Some(lon)) => Ok(Some(GeoPoint::new(lat, lon)?)),
@@ -95,11 +102,12 @@ pub fn point(lat: Option<f64>, lon: Option<f64>) -> Result<Option<GeoPoint>, Api
 
 /// Milliseconds per stage; a stage that ran twice counts once, with its sum.
 pub fn timings_ms(timings: &Timings) -> BTreeMap<&'static str, f64> {
-    let mut all = BTreeMap::new();
+    let mut sums = BTreeMap::new();
     for (stage, took) in timings.iter() {
-        *all.entry(stage.as_str()).or_insert(0.0) += (took.as_secs_f64() * 1e6).round() / 1e3;
+        let whole_microseconds = (took.as_secs_f64() * 1e6).round();
+        *sums.entry(stage.as_str()).or_insert(0.0) += whole_microseconds / 1e3;
     }
-    all
+    sums
 }
 
 /// JSON with the timings in a `Server-Timing` header.
@@ -111,13 +119,18 @@ pub fn timed<T: Serialize>(body: T, timings: &Timings) -> Response {
         let _ = write!(header, "{comma}{stage};dur={ms}");
     }
     let mut response = Json(body).into_response();
-    if let (false, Ok(value)) = (header.is_empty(), HeaderValue::from_str(&header)) {
+    if !header.is_empty()
+        && let Ok(value) = HeaderValue::from_str(&header)
+    {
         response.headers_mut().insert(SERVER_TIMING, value);
     }
     response
 }
 
-/// Reads a JSON object, or a string that holds one (as in a query string).
+/// Reads a JSON object, or a string with the text of one, which is how it comes in a query string.
+///
+/// # Errors
+/// The value is something else.
 pub fn json_object<'de, D: Deserializer<'de>>(
     deserializer: D,
 ) -> Result<Option<Map<String, Value>>, D::Error> {
@@ -133,6 +146,9 @@ pub fn json_object<'de, D: Deserializer<'de>>(
 }
 
 /// Tells a field that is absent (`None`) from one that is null (`Some(None)`).
+///
+/// # Errors
+/// The value is not a `T`.
 pub fn present<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
     deserializer: D,
 ) -> Result<Option<Option<T>>, D::Error> {

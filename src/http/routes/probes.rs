@@ -1,8 +1,8 @@
 //! `/livez`, `/readyz`, `/metrics`: for supervisors, balancers and Prometheus.
 
-use crate::http::AppState;
 use crate::http::body::read_query;
-use crate::http::problem::{ApiError, OwnBody};
+use crate::http::problem::{self, ApiError, OwnBody};
+use crate::http::state::AppState;
 use crate::ops::{Metrics, Unready};
 use axum::extract::State;
 use axum::http::{StatusCode, Uri, header};
@@ -43,9 +43,13 @@ pub struct ProgressBody {
 /// Is the process alive?
 ///
 /// Answers as long as the process can answer anything. Restart it when it does not.
-#[utoipa::path(get, path = "/livez", operation_id = "livez", tag = "service", responses(
-    (status = 200, description = "It is.", body = LiveBody),
-))]
+#[utoipa::path(
+    get,
+    path = "/livez",
+    operation_id = "livez",
+    tag = "service",
+    responses((status = 200, description = "It is.", body = LiveBody)),
+)]
 pub async fn livez() -> Json<LiveBody> {
     Json(LiveBody { status: "live" })
 }
@@ -75,10 +79,17 @@ enum ReadyFor {
 /// 503 with the reason while it cannot; send requests elsewhere meanwhile, do not restart it. A
 /// balancer should ask `/readyz?for=query`: a full disk (`disk_full`) keeps a server from storing,
 /// which it answers with 507 itself, but not from answering queries and deleting.
-#[utoipa::path(get, path = "/readyz", operation_id = "readyz", tag = "service", params(ReadyParams), responses(
-    (status = 200, description = "It can.", body = ReadyBody),
-    (status = 503, description = "It cannot: `status` says why.", body = ReadyBody),
-))]
+#[utoipa::path(
+    get,
+    path = "/readyz",
+    operation_id = "readyz",
+    tag = "service",
+    params(ReadyParams),
+    responses(
+        (status = 200, description = "It can.", body = ReadyBody),
+        (status = 503, description = "It cannot: `status` says why.", body = ReadyBody),
+    ),
+)]
 pub async fn readyz(State(state): State<AppState>, uri: Uri) -> Result<Response, ApiError> {
     let params: ReadyParams = read_query(&uri)?;
     let unready = match params.purpose {
@@ -100,25 +111,33 @@ fn answer(unready: Option<Unready>) -> Response {
         Unready::BuildingIndex { done, total } => Some(ProgressBody { done, total }),
         _ => None,
     };
-    let body = Json(ReadyBody {
+    let body = ReadyBody {
         status: reason.as_str(),
         progress,
-    });
-    (
+    };
+    let mut response = (
         StatusCode::SERVICE_UNAVAILABLE,
         Extension(OwnBody),
-        [(header::RETRY_AFTER, "1")],
-        body,
+        Json(body),
     )
-        .into_response()
+        .into_response();
+    // The same header as of the error `not_ready`, although the body is another.
+    problem::set_error_headers(response.headers_mut(), ErrorCode::NotReady);
+    response
 }
 
 /// Metrics for Prometheus
 ///
 /// In the text exposition format.
-#[utoipa::path(get, path = "/metrics", operation_id = "metrics", tag = "service", responses(
-    (status = 200, description = "All series.", body = String, content_type = "text/plain"),
-))]
+#[utoipa::path(
+    get,
+    path = "/metrics",
+    operation_id = "metrics",
+    tag = "service",
+    responses(
+        (status = 200, description = "All series.", body = String, content_type = "text/plain"),
+    ),
+)]
 pub async fn metrics(State(state): State<AppState>) -> Result<Response, ApiError> {
     state
         .metrics

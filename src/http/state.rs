@@ -1,0 +1,111 @@
+//! What all handlers share.
+
+use super::api_keys::ApiKeys;
+use super::body_budget::BodyBudget;
+use super::config::{AuthConfig, HttpConfig};
+use super::problem::ApiError;
+use super::rate_limits::RateLimits;
+use crate::ops::metrics::Rejection;
+use crate::ops::{Health, Metrics};
+use crate::pipeline::Service;
+use placeformer_core::error::ErrorCode;
+use placeformer_core::types::InvalidValue;
+use std::ops::Deref;
+use std::sync::{Arc, OnceLock};
+use tokio_util::sync::CancellationToken;
+
+/// What every handler shares; cheap to clone.
+#[derive(Clone)]
+pub struct AppState(Arc<SharedState>);
+
+/// The content of an [`AppState`].
+pub struct SharedState {
+    /// Set once start-up is through.
+    service: OnceLock<Arc<Service>>,
+    /// Limits and timeouts of connections and bodies.
+    pub http: HttpConfig,
+    /// Largest image in bytes.
+    pub max_image_bytes: usize,
+    /// The keys that are accepted.
+    pub api_keys: ApiKeys,
+    /// How many requests a second each caller may send.
+    pub rate_limits: RateLimits,
+    /// How much memory the bodies of all requests may take together.
+    pub body_budget: BodyBudget,
+    /// Measurements, shared with the pipeline.
+    pub metrics: Arc<Metrics>,
+    /// Readiness, shared with the pipeline.
+    pub health: Arc<Health>,
+    /// Cancelled when the time for draining is over: requests that still run are then answered
+    /// with `shutting_down`.
+    pub stopping: CancellationToken,
+}
+
+impl Deref for AppState {
+    type Target = SharedState;
+
+    fn deref(&self) -> &SharedState {
+        &self.0
+    }
+}
+
+impl AppState {
+    /// A state that has no service yet.
+    ///
+    /// # Errors
+    /// A setting of the surface, or a configured key, is not valid.
+    pub fn new(
+        http: HttpConfig,
+        auth: &AuthConfig,
+        max_image_bytes: usize,
+        metrics: Arc<Metrics>,
+        health: Arc<Health>,
+    ) -> Result<Self, InvalidValue> {
+        http.check()?;
+        let shared = SharedState {
+            service: OnceLock::new(),
+            max_image_bytes,
+            api_keys: ApiKeys::new(auth)?,
+            rate_limits: RateLimits::new(auth, metrics.clone()),
+            body_budget: BodyBudget::new(http.max_buffered_bytes, metrics.clone()),
+            http,
+            metrics,
+            health,
+            stopping: CancellationToken::new(),
+        };
+        Ok(Self(Arc::new(shared)))
+    }
+
+    /// Lets requests through to `service`. Only the first call counts.
+    pub fn open(&self, service: Arc<Service>) {
+        if self.service.set(service).is_err() {
+            tracing::error!("the service was opened twice; the first one stays");
+        }
+        // Readiness comes last: a client that is told that the server is ready must not have its
+        // next request refused.
+        self.health.serving();
+    }
+
+    /// The service, if start-up is through.
+    pub fn started(&self) -> Option<&Arc<Service>> {
+        self.service.get()
+    }
+
+    /// The service.
+    ///
+    /// # Errors
+    /// `not_ready` before start-up is through.
+    pub fn service(&self) -> Result<&Arc<Service>, ApiError> {
+        self.service.get().ok_or_else(|| self.not_ready())
+    }
+
+    fn not_ready(&self) -> ApiError {
+        self.metrics.rejected(Rejection::NotReady);
+        let reason = match self.health.unready() {
+            Some(reason) => reason.as_str(),
+            None => "starting",
+        };
+        let detail = format!("the server is not ready yet: {reason}");
+        ApiError::new(ErrorCode::NotReady, detail)
+    }
+}
