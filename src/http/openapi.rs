@@ -6,12 +6,13 @@
 
 use super::body::ImageUpload;
 use super::examples;
-use super::problem::{ErrorHeader, PROBLEM_JSON, ProblemBody};
+use super::problem::{ApiError, ErrorHeader, PROBLEM_JSON, ProblemBody};
 use super::route::{Handler, RequestBody, Route, Scope};
 use super::routes::ROUTES;
 use super::state::AppState;
 use crate::ops::Metrics;
 use placeformer_core::error::ErrorCode;
+use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
@@ -65,7 +66,7 @@ fn described_by_attributes() -> Value {
             router = router.routes(operation());
         }
     }
-    serde_json::to_value(router.into_openapi()).unwrap_or_default()
+    to_value(router.into_openapi())
 }
 
 /// The part of the document about `route`; `None` if it is a page, which the document leaves out.
@@ -104,9 +105,9 @@ fn describe_service(document: &mut Value) {
     ]);
 }
 
-/// The value of a schema, which always serialises.
-fn to_value(schema: impl serde::Serialize) -> Value {
-    serde_json::to_value(schema).unwrap_or_default()
+/// A part of the document as JSON. Schemas, operations and errors always serialise.
+fn to_value(part: impl Serialize) -> Value {
+    serde_json::to_value(part).unwrap_or_default()
 }
 
 fn describe_body(operation: &mut Value, body: &RequestBody) {
@@ -247,15 +248,8 @@ fn describe_header(header: ErrorHeader) -> Value {
 
 /// An error as it is sent.
 fn problem(code: ErrorCode) -> Value {
-    json!({
-        "type": format!("urn:placeformer:error:{}", code.as_str()),
-        "title": code.title(),
-        "status": code.status(),
-        "code": code.as_str(),
-        "detail": "what exactly is wrong with this request",
-        "request_id": "0197f3c2-7c1e-7d3a-9b1f-2f6f0c1d2e3f",
-        "retryable": code.retryable(),
-    })
+    let error = ApiError::new(code, "what exactly is wrong with this request");
+    to_value(error.body("0197f3c2-7c1e-7d3a-9b1f-2f6f0c1d2e3f"))
 }
 
 /// Nothing, or a key in either header: a server without keys needs none.

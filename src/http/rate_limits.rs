@@ -103,7 +103,8 @@ mod tests {
             ..Default::default()
         };
         let limits = RateLimits::new(&config, metrics());
-        let (one, other) = ("10.0.0.1".parse().unwrap(), "10.0.0.2".parse().unwrap());
+        let one = "10.0.0.1".parse().unwrap();
+        let other = "10.0.0.2".parse().unwrap();
         assert!(
             limits.check(&Caller::Address(one)).is_ok()
                 && limits.check(&Caller::Address(one)).is_ok()

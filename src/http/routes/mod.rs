@@ -317,10 +317,11 @@ pub fn routes_at(path: &str) -> impl Iterator<Item = &'static Route> {
     ROUTES.iter().filter(move |route| route.path == path)
 }
 
-/// Who may send `method` to `path`.
+/// Who may send `method` to `path`, a path of the table.
 ///
-/// A method that no route of the path answers leads to the status 405. Who may see that is decided
-/// as if the method existed: as for the path's other methods that read, or that change something.
+/// A method that no route of the path answers leads to the status 405, which names the methods that
+/// there are. That answer is for callers who might use the path. So the method is treated like the
+/// path's routes of the same kind, where there are two kinds: methods that only read, and others.
 pub fn scope_of(method: &Method, path: &str) -> Scope {
     if let Some(route) = routes_at(path).find(|route| route.answers(method)) {
         return route.scope;
@@ -332,7 +333,8 @@ pub fn scope_of(method: &Method, path: &str) -> Scope {
     if only_reads(method) {
         return Scope::Key(Role::Read);
     }
-    match routes_at(path).find(|route| !only_reads(&route.method)) {
+    let changing = routes_at(path).find(|route| !only_reads(&route.method));
+    match changing {
         Some(route) => route.scope,
         None => Scope::Key(Role::Write),
     }
@@ -342,7 +344,8 @@ fn only_reads(method: &Method) -> bool {
     matches!(*method, Method::GET | Method::HEAD | Method::OPTIONS)
 }
 
-/// How loud the log is about requests to `path`; also about those to paths that do not exist.
+/// How loud the log is about requests to `path`, whatever their method. Requests to paths that do
+/// not exist are logged.
 pub fn access_log_of(path: &str) -> AccessLog {
     let is_quiet = routes_at(path).any(|route| route.access_log == AccessLog::Quiet);
     if is_quiet {
@@ -399,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn a_method_that_a_path_lacks_needs_what_its_like_needs() {
+    fn an_unsupported_method_has_the_scope_of_those_of_its_kind() {
         let key = Scope::Key;
         for (method, path, scope) in [
             (Method::HEAD, "/maps", key(Role::Read)),
