@@ -119,10 +119,14 @@ fn describe_body(operation: &mut Value, body: &RequestBody) {
                 content["example"] = example();
             }
         }
-        RequestBody::File { description, .. } => {
+        RequestBody::File {
+            max_bytes,
+            description,
+        } => {
+            let max_mib = max_bytes >> 20;
             operation["requestBody"] = json!({
                 "required": true,
-                "description": description,
+                "description": format!("{description}, at most {max_mib} MiB."),
                 "content": {"application/octet-stream": bytes_content()},
             });
         }

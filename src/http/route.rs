@@ -69,7 +69,7 @@ pub enum RequestBody {
     File {
         /// Its largest size.
         max_bytes: usize,
-        /// What it has to be, for the OpenAPI document.
+        /// What it has to be, for the OpenAPI document, which adds the size.
         description: &'static str,
     },
     /// Images with parameters, each image of at most the configured size.

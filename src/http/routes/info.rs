@@ -1,6 +1,6 @@
 //! `/info`: what this server runs.
 
-use super::match_images::SizeBody;
+use super::shapes::SizeBody;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use axum::Json;

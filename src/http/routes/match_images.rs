@@ -1,6 +1,6 @@
 //! `/match`: the evidence that two images show the same place.
 
-use super::shapes::{timed, timings_ms};
+use super::shapes::{SizeBody, timed, timings_ms};
 use crate::http::body::{ImageUpload, read_upload};
 use crate::http::examples;
 use crate::http::problem::ApiError;
@@ -58,15 +58,6 @@ pub struct MatchAnswerBody {
     pub timings_ms: BTreeMap<&'static str, f64>,
     /// The model that computed it.
     pub model: String,
-}
-
-/// Width and height in pixels.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct SizeBody {
-    /// Pixels per row.
-    pub width: u32,
-    /// Rows.
-    pub height: u32,
 }
 
 /// One scale combination with its evidence.

@@ -199,7 +199,7 @@ pub static ROUTES: &[Route] = &[
         access_log: AccessLog::Logged,
         body: RequestBody::File {
             max_bytes: maps::MAX_HEAD_BYTES,
-            description: "The head's safetensors file, at most 32 MiB.",
+            description: "The head's safetensors file",
         },
         own_errors: &[
             ErrorCode::MapNotFound,

@@ -16,6 +16,15 @@ use utoipa::ToSchema;
 /// Header with the time in each stage.
 const SERVER_TIMING: HeaderName = HeaderName::from_static("server-timing");
 
+/// Width and height in pixels.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct SizeBody {
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
 /// Where a photo was taken and where its camera looked.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct LocationBody {
