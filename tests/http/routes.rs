@@ -130,6 +130,20 @@ async fn other_methods_show_which_there_are_only_to_those_who_may_use_the_path()
 // ---------------------------------------------------------------- methods
 
 #[tokio::test]
+async fn requests_are_counted_under_the_path_of_their_route() {
+    let app = App::new();
+    for path in paths() {
+        let series = format!("placeformer_http_request_duration_seconds_count{{route=\"{path}\"}}");
+        let text = app.get("/metrics").await.text;
+        let is_expected = operations().any(|route| route.path == path);
+        assert_eq!(text.contains(&series), is_expected, "{path} at start");
+
+        app.get(&filled(path, UNKNOWN_ID, "none")).await;
+        assert!(app.metric(&series).await >= 1.0, "{path}");
+    }
+}
+
+#[tokio::test]
 async fn every_other_method_is_refused_with_those_of_the_table() {
     let app = App::new();
     for path in paths() {
