@@ -8,10 +8,12 @@
 //! | [`geography`] | UTM zones and the image names that carry UTM positions |
 //! | [`folder`] | the images below a folder |
 //! | [`progress`] | how far a long task has come |
+//! | [`retry`] | trying again what failed for a reason that may pass |
 
 pub mod error;
 pub mod files;
 pub mod folder;
 pub mod geography;
 pub mod progress;
+pub mod retry;
 pub mod types;

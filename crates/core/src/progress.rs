@@ -32,7 +32,7 @@ pub struct Step<'a> {
 }
 
 /// Shows how far tasks have come. Tasks may run inside one another and on several threads.
-pub trait Progress: Sync {
+pub trait Progress: Send + Sync {
     /// A task has begun or come further.
     fn update(&self, step: Step<'_>);
 
