@@ -6,7 +6,7 @@ use crate::cli::progress::ProgressBars;
 use anyhow::Context;
 use clap::Args;
 use placeformer_models::open_extractor;
-use placeformer_vision::extract::{ExtractionTrace, Extractor, TraceArray, TraceValues};
+use placeformer_vision::extract::{ExtractionTrace, Extractor, TraceValues};
 use placeformer_vision::image::{ImageConfig, load_tensor};
 use safetensors::tensor::{Dtype, TensorView};
 use serde_json::{Value, json};

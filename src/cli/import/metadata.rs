@@ -98,8 +98,9 @@ impl Metadata {
         })
     }
 
+    /// What the name says, if it is one of the UTM names.
     fn from_name(&self, name: &str) -> Option<Row> {
-        let parsed = UtmName::parse(name)?;
+        let parsed = UtmName::parse(name).ok()?;
         Some(Row {
             location: parsed.location(self.zone),
             heading: parsed.heading,
