@@ -330,7 +330,9 @@ fn zero_weights() -> VitWeights {
     use placeformer_vision::extract::{BlockWeights, Linear, Norm};
     let preset = Preset::Dinov2Vits14;
     let geometry = preset.geometry();
-    let (dim, mlp, position_grid) = (geometry.dim, geometry.mlp_dim, (37, 37));
+    let dim = geometry.dim;
+    let mlp = geometry.mlp_dim;
+    let position_grid = (37, 37);
     let linear = |from: usize, to: usize| Linear {
         weight: vec![0.0; from * to],
         bias: vec![0.0; to],

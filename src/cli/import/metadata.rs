@@ -84,7 +84,7 @@ impl Metadata {
         image: &[u8],
     ) -> Result<ReferenceFields, String> {
         let listed = self.rows.get(name).copied().unwrap_or_default();
-        let named = self.from_name(name).unwrap_or_default();
+        let named = self.row_of_name(name).unwrap_or_default();
         let row = listed.or(named).or(from_exif(image));
         if self.require_position && row.location.is_none() {
             return Err("no position in the positions file, the name or the EXIF".into());
@@ -99,7 +99,7 @@ impl Metadata {
     }
 
     /// What the name says, if it is one of the UTM names.
-    fn from_name(&self, name: &str) -> Option<Row> {
+    fn row_of_name(&self, name: &str) -> Option<Row> {
         let parsed = UtmName::parse(name).ok()?;
         Some(Row {
             location: parsed.location(self.zone),
