@@ -8,6 +8,7 @@ use crate::config::Config;
 use crate::http::{AppState, serve};
 use crate::ops::{Health, Metrics, disk, shutdown};
 use crate::pipeline::{DescriptorSource, Parts, PipelineError, Service};
+use placeformer_core::progress::Progress;
 use placeformer_core::types::InvalidValue;
 use placeformer_models::open_extractor;
 use placeformer_store::{PlaceStore, SqliteStore, StoreConfig, StoreError};
@@ -87,24 +88,27 @@ pub struct OpenStoreError {
     pub source: StoreError,
 }
 
-/// Loaders of the model and the store that `config` names.
-pub fn loaders(config: &Config) -> Loaders {
+/// The parts that `config` names; `progress` shows a download of the model.
+pub fn loaders(config: &Config, progress: Arc<dyn Progress>) -> Loaders {
     let extract = config.extract.clone();
     let directory = config.data.directory.clone();
     let store = config.store.clone();
     Loaders {
-        source: Box::new(move || open_model(&extract)),
+        source: Box::new(move || open_model(&extract, &*progress)),
         store: Box::new(move || Ok(open_store(&directory, &store)?)),
     }
 }
 
-/// Loads the model and lets it describe one image, so that the first request is as fast as later
-/// ones.
+/// Loads the model and has it describe one image, so that the first request is as fast as the next.
+/// `progress` shows a download.
 ///
 /// # Errors
 /// The weights cannot be obtained, or weights, head and settings do not fit.
-pub fn open_model(config: &ExtractConfig) -> Result<Arc<dyn DescriptorSource>, LoadError> {
-    let extractor = open_extractor(config)?;
+pub fn open_model(
+    config: &ExtractConfig,
+    progress: &dyn Progress,
+) -> Result<Arc<dyn DescriptorSource>, LoadError> {
+    let extractor = open_extractor(config, progress)?;
     extractor.warm_up()?;
     Ok(Arc::new(extractor))
 }

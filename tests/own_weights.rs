@@ -1,6 +1,7 @@
 //! A server of one's own weights and head, as `train` writes them, and where its settings come
 //! from: the real binary.
 
+use placeformer_core::progress::Silent;
 use placeformer_core::types::{GLOBAL_DIM, ImageSize};
 use placeformer_models::open_extractor;
 use placeformer_vision::extract::{
@@ -79,7 +80,7 @@ impl Own {
             ..Default::default()
         };
         weights().save(config.weights.as_ref().unwrap()).unwrap();
-        let without_head = open_extractor(&config).unwrap();
+        let without_head = open_extractor(&config, &Silent).unwrap();
         let weight = (0..GLOBAL_DIM * 384)
             .map(|i| ((i * 37 % 101) as f32 - 50.0) / 100.0)
             .collect();
@@ -94,10 +95,13 @@ impl Own {
         .unwrap();
         let head_path = folder.path().join("head.safetensors");
         head.save(&head_path).unwrap();
-        let with_head = open_extractor(&ExtractConfig {
-            head: HeadChoice::File(head_path),
-            ..config
-        })
+        let with_head = open_extractor(
+            &ExtractConfig {
+                head: HeadChoice::File(head_path),
+                ..config
+            },
+            &Silent,
+        )
         .unwrap();
         let text = "[extract]\npreset = \"placeformer-vits16\"\ninput_size = { width = 64, height = 48 }\n\
                     [pipeline]\ndisk_reserve_bytes = 0\n[store]\nreserve_bytes = 1048576\n";

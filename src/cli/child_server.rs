@@ -1,18 +1,18 @@
-//! A server process of a command's own.
+//! A server process that a command starts for itself, such as the demo's.
 
 use super::client::{ServerArgs, ServerClient};
 use anyhow::{Context, bail, ensure};
 use std::ffi::OsString;
 use std::fs::File;
 use std::io::{BufRead, BufReader};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// Longest wait for readiness: loading a model takes seconds, building the index of millions a
 /// minute.
 const START_LIMIT: Duration = Duration::from_secs(300);
-/// Longest wait for a drain.
+/// Longest wait for a server that was asked to stop, which answers what it has begun.
 const STOP_LIMIT: Duration = Duration::from_secs(30);
 
 /// A running server; killed when dropped.
@@ -29,26 +29,18 @@ impl ChildServer {
         arguments: impl IntoIterator<Item = OsString>,
         log: PathBuf,
     ) -> anyhow::Result<Self> {
-        let log_file =
-            File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
-        let program = std::env::current_exe().context("cannot find this program's own file")?;
-        let mut child = Command::new(program)
-            .args(arguments)
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(log_file)
-            .spawn()
-            .context("cannot start the server")?;
+        let mut child = spawn(arguments, &log)?;
         let mut first_line = String::new();
         if let Some(stdout) = child.stdout.take() {
             BufReader::new(stdout).read_line(&mut first_line)?;
         }
-        let url = first_line
-            .trim()
-            .strip_prefix("listening on ")
-            .unwrap_or_default()
-            .to_owned();
-        let server = Self { child, url, log };
+        let url = first_line.trim().strip_prefix("listening on ");
+        // From here on the process is ended when something fails.
+        let server = Self {
+            child,
+            url: url.unwrap_or_default().to_owned(),
+            log,
+        };
         ensure!(
             !server.url.is_empty(),
             "the server did not start; see {}",
@@ -88,7 +80,7 @@ impl ChildServer {
         )
     }
 
-    /// Asks it to stop, as a supervisor would, and waits for the drain.
+    /// Asks it to stop, as a supervisor would, and waits until it has ended.
     pub(super) fn stop(mut self) -> anyhow::Result<()> {
         let asked = Command::new("kill")
             .args(["-TERM", &self.child.id().to_string()])
@@ -113,9 +105,22 @@ impl ChildServer {
     }
 }
 
+/// Starts this program with its standard output piped and its standard error in `log`.
+fn spawn(arguments: impl IntoIterator<Item = OsString>, log: &Path) -> anyhow::Result<Child> {
+    let log_file = File::create(log).with_context(|| format!("cannot write {}", log.display()))?;
+    let program = std::env::current_exe().context("cannot find this program's own file")?;
+    Command::new(program)
+        .args(arguments)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(log_file)
+        .spawn()
+        .context("cannot start the server")
+}
+
 impl Drop for ChildServer {
     fn drop(&mut self) {
-        // Already stopped in the good case; then there is nothing to kill and the error says only
+        // Mostly it has stopped already. Then there is nothing to kill, and the error says only
         // that.
         let _ = self.child.kill();
         let _ = self.child.wait();

@@ -2,10 +2,11 @@
 
 use super::model_args::ModelOptions;
 use crate::cli::output::{OutputError, say};
+use crate::cli::progress::ProgressBars;
 use anyhow::Context;
 use clap::Args;
 use placeformer_models::open_extractor;
-use placeformer_vision::extract::{ExtractionTrace, Extractor, TraceArray, TraceValues};
+use placeformer_vision::extract::{ExtractionTrace, Extractor, TraceValues};
 use placeformer_vision::image::{ImageConfig, load_tensor};
 use safetensors::tensor::{Dtype, TensorView};
 use serde_json::{Value, json};
@@ -28,7 +29,7 @@ pub struct ExtractArgs {
 
 /// Runs it.
 pub fn run(args: ExtractArgs) -> anyhow::Result<()> {
-    let extractor = open_extractor(&args.model.extract_config()?)?;
+    let extractor = open_extractor(&args.model.extract_config()?, &ProgressBars::default())?;
     let bytes = std::fs::read(&args.image).with_context(|| args.image.display().to_string())?;
     let image = load_tensor(&bytes, &ImageConfig::default(), extractor.input_size())
         .with_context(|| args.image.display().to_string())?;
@@ -36,26 +37,29 @@ pub fn run(args: ExtractArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.safetensors {
         write_safetensors(path, &trace, &extractor)?;
     }
-    match args.json {
-        true => say!("{}", serde_json::to_string(&as_json(&trace, &extractor))?)?,
-        false => print_summary(&trace, &extractor)?,
+    if args.json {
+        say!("{}", as_json(&trace, &extractor))?;
+    } else {
+        print_summary(&trace, &extractor)?;
     }
     Ok(())
 }
 
 fn as_json(trace: &ExtractionTrace, extractor: &Extractor) -> Value {
-    let array = |array: TraceArray| {
+    let mut arrays = serde_json::Map::new();
+    for array in trace.arrays() {
         let values = match array.values {
             TraceValues::F32(values) => json!(values),
             TraceValues::I64(values) => json!(values),
         };
-        (array.name, json!({"shape": array.shape, "values": values}))
-    };
+        let array_json = json!({"shape": array.shape, "values": values});
+        arrays.insert(array.name, array_json);
+    }
     json!({
         "model": extractor.model_id(),
         "spec": trace.spec,
         "grid": trace.encoded.grid,
-        "arrays": trace.arrays().into_iter().map(array).collect::<serde_json::Map<_, _>>(),
+        "arrays": arrays,
     })
 }
 
@@ -65,33 +69,28 @@ fn write_safetensors(
     extractor: &Extractor,
 ) -> anyhow::Result<()> {
     let arrays = trace.arrays();
-    let views: Result<Vec<_>, _> = arrays
-        .iter()
-        .map(|array| {
-            let (dtype, bytes): (_, &[u8]) = match &array.values {
-                TraceValues::F32(values) => (Dtype::F32, bytemuck::cast_slice(values)),
-                TraceValues::I64(values) => (Dtype::I64, bytemuck::cast_slice(values)),
-            };
-            TensorView::new(dtype, array.shape.clone(), bytes).map(|view| (&array.name, view))
-        })
-        .collect();
+    let mut views = Vec::with_capacity(arrays.len());
+    for array in &arrays {
+        let (dtype, bytes): (_, &[u8]) = match &array.values {
+            TraceValues::F32(values) => (Dtype::F32, bytemuck::cast_slice(values)),
+            TraceValues::I64(values) => (Dtype::I64, bytemuck::cast_slice(values)),
+        };
+        let view = TensorView::new(dtype, array.shape.clone(), bytes)?;
+        views.push((&array.name, view));
+    }
     let metadata = [("model".to_owned(), extractor.model_id().to_string())].into();
-    safetensors::serialize_to_file(views?, Some(metadata), path)
+    safetensors::serialize_to_file(views, Some(metadata), path)
         .with_context(|| path.display().to_string())
 }
 
 fn print_summary(trace: &ExtractionTrace, extractor: &Extractor) -> Result<(), OutputError> {
     say!("model {}", extractor.model_id())?;
     for array in trace.arrays() {
-        let shape = array
-            .shape
-            .iter()
-            .map(usize::to_string)
-            .collect::<Vec<_>>()
-            .join("x");
-        let (low, high, mean) = match &array.values {
-            TraceValues::F32(values) => range(values.iter().map(|&v| v as f64)),
-            TraceValues::I64(values) => range(values.iter().map(|&v| v as f64)),
+        let sides: Vec<String> = array.shape.iter().map(usize::to_string).collect();
+        let shape = sides.join("x");
+        let Summary { low, high, mean } = match &array.values {
+            TraceValues::F32(values) => summarise(values.iter().map(|&value| value as f64)),
+            TraceValues::I64(values) => summarise(values.iter().map(|&value| value as f64)),
         };
         say!(
             "{:32} {shape:>12}  min {low:>10.4}  max {high:>10.4}  mean {mean:>10.4}",
@@ -101,9 +100,24 @@ fn print_summary(trace: &ExtractionTrace, extractor: &Extractor) -> Result<(), O
     Ok(())
 }
 
-fn range(values: impl Iterator<Item = f64> + Clone) -> (f64, f64, f64) {
-    let count = values.clone().count().max(1) as f64;
-    let low = values.clone().fold(f64::INFINITY, f64::min);
-    let high = values.clone().fold(f64::NEG_INFINITY, f64::max);
-    (low, high, values.sum::<f64>() / count)
+/// Range and mean of an array.
+struct Summary {
+    low: f64,
+    high: f64,
+    mean: f64,
+}
+
+fn summarise(values: impl Iterator<Item = f64>) -> Summary {
+    let mut low = f64::INFINITY;
+    let mut high = f64::NEG_INFINITY;
+    let mut sum = 0.0;
+    let mut count: usize = 0;
+    for value in values {
+        low = low.min(value);
+        high = high.max(value);
+        sum += value;
+        count += 1;
+    }
+    let mean = sum / count.max(1) as f64;
+    Summary { low, high, mean }
 }

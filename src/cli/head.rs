@@ -3,6 +3,7 @@
 use super::model_args::ModelOptions;
 use super::train::{HeadTrainArgs, train_head};
 use crate::cli::output::say;
+use crate::cli::progress::ProgressBars;
 use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -109,7 +110,7 @@ fn fit(args: FitArgs) -> anyhow::Result<()> {
         None
     };
     let mut reader = Reader {
-        extractor: open_extractor(&config)?,
+        extractor: open_extractor(&config, &ProgressBars::default())?,
         unreadable: BTreeSet::new(),
     };
     let (aggregate, files) = match (args.aggregate, gem) {

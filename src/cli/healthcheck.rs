@@ -22,10 +22,12 @@ pub struct HealthcheckArgs {
 /// A full disk alone is no failure: a supervisor that restarted the server, or a balancer that left
 /// it out, would end the queries and deletions that still work and gain nothing.
 pub fn run(args: HealthcheckArgs) -> anyhow::Result<()> {
-    let path = match (args.live, args.ingest) {
-        (true, _) => "/livez",
-        (_, true) => "/readyz",
-        _ => "/readyz?for=query",
+    let path = if args.live {
+        "/livez"
+    } else if args.ingest {
+        "/readyz"
+    } else {
+        "/readyz?for=query"
     };
     let (status, body) = ServerClient::new(args.server)?.probe(path)?;
     ensure!(status == 200, "not ready ({status}): {body}");

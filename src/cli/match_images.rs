@@ -2,6 +2,7 @@
 
 use super::model_args::ModelOptions;
 use crate::cli::output::{OutputError, say};
+use crate::cli::progress::ProgressBars;
 use anyhow::{Context, bail};
 use placeformer_core::types::ScaleSet;
 use placeformer_lab::eval::evidence::{Seen, picture};
@@ -53,7 +54,7 @@ pub fn run(args: MatchArgs) -> anyhow::Result<()> {
     } else {
         Some(encoder(&args.out)?)
     };
-    let extractor = open_extractor(&args.model.extract_config()?)?;
+    let extractor = open_extractor(&args.model.extract_config()?, &ProgressBars::default())?;
     let limits = ImageConfig::default();
     let see = |path: &Path| {
         let bytes =

@@ -18,6 +18,7 @@ pub mod model;
 pub mod model_args;
 pub mod openapi;
 pub mod output;
+mod progress;
 pub mod query;
 pub mod serve;
 pub mod synth;

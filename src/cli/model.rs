@@ -1,13 +1,15 @@
 //! Obtain and inspect models.
 
 use crate::cli::output::say;
-use anyhow::Context;
+use crate::cli::progress::ProgressBars;
+use anyhow::{Context, ensure};
 use clap::{Args, Subcommand};
+use placeformer_core::files::hash_file;
 use placeformer_models::{model_path, pull_model, resolve_model};
 use placeformer_vision::extract::{
-    ExtractConfig, ExtractError, Extractor, HeadChoice, Preset, Record, VitWeights,
+    ExtractConfig, ExtractError, Extractor, HeadChoice, Preset, VitWeights, verify_weights,
 };
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::PathBuf;
 
 /// Arguments of this subcommand.
@@ -62,7 +64,7 @@ struct InfoArgs {
 pub fn run(args: ModelArgs) -> anyhow::Result<()> {
     match args.command {
         ModelCommand::Pull { name, force } => {
-            let path = pull_model(name, force)?;
+            let path = pull_model(name, force, &ProgressBars::default())?;
             say!("{name}: {}", path.display())?;
             Ok(())
         }
@@ -72,35 +74,18 @@ pub fn run(args: ModelArgs) -> anyhow::Result<()> {
 }
 
 fn info(args: InfoArgs) -> anyhow::Result<()> {
-    let (preset, path) = match args.model.parse::<Preset>() {
-        Ok(preset) => (preset, resolve_model(preset)?),
-        Err(unknown) => {
-            let path = PathBuf::from(&args.model);
-            anyhow::ensure!(path.exists(), "{unknown}, nor a file");
-            (args.preset, path)
-        }
-    };
+    let (preset, path) = locate(&args)?;
     let config = ExtractConfig {
         preset,
         heads: args.heads,
         ..ExtractConfig::default()
     };
-    let record = placeformer_vision::extract::verify_weights(&path)?;
+    let record = verify_weights(&path)?;
     let weights = VitWeights::load(&path, preset, args.heads)?;
-    let built_in = Extractor::from_weights(&config, &weights, &HeadChoice::Default);
-    let (extractor, head) = match built_in {
-        Ok(extractor) => (extractor, "built in"),
-        Err(ExtractError::NoHead { .. }) => (
-            Extractor::from_weights(&config, &weights, &HeadChoice::None)?,
-            "none built in",
-        ),
-        Err(error) => return Err(error.into()),
-    };
+    let (extractor, head) = with_built_in_head(&config, &weights)?;
     let sha256 = match &record {
-        Some(Record { sha256, .. }) => sha256.clone(),
-        None => {
-            placeformer_core::files::hash_file(&path).with_context(|| path.display().to_string())?
-        }
+        Some(record) => record.sha256.clone(),
+        None => hash_file(&path).with_context(|| path.display().to_string())?,
     };
     let report = json!({
         "preset": preset,
@@ -129,39 +114,71 @@ fn info(args: InfoArgs) -> anyhow::Result<()> {
     }
 }
 
+/// The weights file and its geometry: of a preset by name, or of a file by `--preset`.
+fn locate(args: &InfoArgs) -> anyhow::Result<(Preset, PathBuf)> {
+    match args.model.parse::<Preset>() {
+        Ok(preset) => {
+            let path = resolve_model(preset, &ProgressBars::default())?;
+            Ok((preset, path))
+        }
+        Err(unknown) => {
+            let path = PathBuf::from(&args.model);
+            ensure!(path.exists(), "{unknown}, nor a file");
+            Ok((args.preset, path))
+        }
+    }
+}
+
+/// The model with the head that ships for it, or without a head if there is none; and which of the
+/// two it is.
+fn with_built_in_head(
+    config: &ExtractConfig,
+    weights: &VitWeights,
+) -> Result<(Extractor, &'static str), ExtractError> {
+    match Extractor::from_weights(config, weights, &HeadChoice::Default) {
+        Ok(extractor) => Ok((extractor, "built in")),
+        Err(ExtractError::NoHead { .. }) => {
+            let extractor = Extractor::from_weights(config, weights, &HeadChoice::None)?;
+            Ok((extractor, "none built in"))
+        }
+        Err(error) => Err(error),
+    }
+}
+
 fn list(json: bool) -> anyhow::Result<()> {
     let mut models = Vec::new();
     for preset in Preset::ALL {
         let path = model_path(preset)?;
         let pulled = path.exists().then_some(path);
-        models
-            .push(json!({"name": preset, "summary": preset.summary(), "hub": preset.hub_repository(), "file": pulled}));
+        models.push(json!({
+            "name": preset,
+            "summary": preset.summary(),
+            "hub": preset.hub_repository(),
+            "file": pulled,
+        }));
     }
     if json {
         return print_json(&json!(models));
     }
     for model in models {
         let text = |key: &str| model[key].as_str().unwrap_or("-").to_owned();
-        say!(
-            "{:20} {:62} {}",
-            text("name"),
-            text("summary"),
-            text("file")
-        )?;
+        let name = text("name");
+        let summary = text("summary");
+        say!("{name:20} {summary:62} {}", text("file"))?;
     }
     Ok(())
 }
 
-fn print_json(value: &serde_json::Value) -> anyhow::Result<()> {
+fn print_json(value: &Value) -> anyhow::Result<()> {
     say!("{}", serde_json::to_string_pretty(value)?)?;
     Ok(())
 }
 
-fn print_table(report: &serde_json::Value) -> anyhow::Result<()> {
+fn print_table(report: &Value) -> anyhow::Result<()> {
     for (key, value) in report.as_object().context("the report is an object")? {
         match value {
-            serde_json::Value::Null => {}
-            serde_json::Value::String(text) => say!("{key:16} {text}")?,
+            Value::Null => {}
+            Value::String(text) => say!("{key:16} {text}")?,
             other => say!("{key:16} {other}")?,
         }
     }

@@ -1,5 +1,6 @@
 //! Flags that choose the model and its settings, for the subcommands that run it themselves.
 
+use anyhow::anyhow;
 use placeformer_core::types::{ImageSize, PoolingStride, SCALES};
 use placeformer_vision::extract::{ExtractConfig, HeadChoice, Precision, Preset};
 use std::path::PathBuf;
@@ -53,6 +54,9 @@ fn parse_stride(text: &str) -> Result<PoolingStride, String> {
 
 impl ModelOptions {
     /// The settings, checked.
+    ///
+    /// # Errors
+    /// A setting does not fit the preset.
     pub fn extract_config(&self) -> anyhow::Result<ExtractConfig> {
         let mut config = ExtractConfig {
             preset: self.preset,
@@ -67,7 +71,7 @@ impl ModelOptions {
         };
         if let Some(caps) = &self.caps {
             config.caps = <[usize; SCALES]>::try_from(caps.as_slice())
-                .map_err(|_| anyhow::anyhow!("--caps needs three numbers, such as 400,200,50"))?;
+                .map_err(|_| anyhow!("--caps needs three numbers, such as 400,200,50"))?;
         }
         config.tau = self.tau.unwrap_or(config.tau);
         config.stride = self.stride.unwrap_or(config.stride);

@@ -1,7 +1,7 @@
 //! Lines on standard output.
 //!
-//! `println!` panics when the reader of a pipe has gone, as `head` does when it has enough;
-//! [`say!`] returns an error instead, on which `main` ends without a word.
+//! `println!` panics when the reader of a pipe has gone, as `head` goes when it has enough.
+//! [`say!`] returns an error instead, on which `main` ends silently.
 
 use std::fmt;
 use std::io::{self, Write, stdout};
@@ -66,7 +66,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_has_gone_is_told_from_a_full_disk() {
+    fn a_reader_that_has_gone_is_distinguished_from_a_full_disk() {
         let refused = |kind| write_to(&mut Refusing(kind), format_args!("text"));
         assert!(matches!(
             refused(io::ErrorKind::BrokenPipe),

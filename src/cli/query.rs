@@ -46,73 +46,81 @@ pub struct QueryArgs {
 
 /// Runs it.
 pub fn run(args: QueryArgs) -> anyhow::Result<()> {
+    let parameters = parameters(&args);
+    let client = ServerClient::new(args.server)?;
+    let answer = client.post_image("/query", &args.image, &parameters)?;
+    if args.json {
+        say!("{}", serde_json::to_string_pretty(&answer)?)?;
+    } else {
+        print_answer(&answer)?;
+    }
+    Ok(())
+}
+
+fn parameters(args: &QueryArgs) -> Vec<(&'static str, String)> {
     let mut parameters = vec![
         ("map", args.map.to_string()),
         ("top_k", args.top_k.to_string()),
         ("rerank", (!args.no_rerank).to_string()),
     ];
-    parameters.extend(
-        args.candidates
-            .map(|count| ("candidates", count.to_string())),
-    );
-    parameters.extend(args.near.map(|near| ("near", near)));
-    parameters.extend(args.radius_m.map(|radius| ("radius_m", radius.to_string())));
-    parameters.extend(args.deadline_ms.map(|ms| ("deadline_ms", ms.to_string())));
-    let answer = ServerClient::new(args.server)?.post_image("/query", &args.image, &parameters)?;
-    if args.json {
-        say!("{}", serde_json::to_string_pretty(&answer)?)?;
-    } else {
-        print_table(&answer)?;
+    if let Some(count) = args.candidates {
+        parameters.push(("candidates", count.to_string()));
     }
-    Ok(())
+    if let Some(near) = &args.near {
+        parameters.push(("near", near.clone()));
+    }
+    if let Some(radius) = args.radius_m {
+        parameters.push(("radius_m", radius.to_string()));
+    }
+    if let Some(deadline) = args.deadline_ms {
+        parameters.push(("deadline_ms", deadline.to_string()));
+    }
+    parameters
 }
 
-fn print_table(answer: &Value) -> Result<(), OutputError> {
-    let results = answer["results"]
-        .as_array()
-        .map(Vec::as_slice)
-        .unwrap_or_default();
-    say!(
-        "{:>4} {:>6} {:>8}  {:<22} reference",
-        "rank",
-        "S",
-        "distance",
-        "position"
-    )?;
+fn print_answer(answer: &Value) -> Result<(), OutputError> {
+    let results = answer["results"].as_array();
+    let results = results.map(Vec::as_slice).unwrap_or_default();
+    say!("rank      S distance  {:<22} reference", "position")?;
     for result in results {
-        let score = result["spatial_score"]
-            .as_u64()
-            .map_or("-".into(), |score| score.to_string());
-        let position = match (
-            result["location"]["lat"].as_f64(),
-            result["location"]["lon"].as_f64(),
-        ) {
-            (Some(lat), Some(lon)) => format!("{lat:.6},{lon:.6}"),
-            _ => "-".into(),
-        };
-        let name = result["external_id"]
-            .as_str()
-            .or(result["reference_id"].as_str())
-            .unwrap_or_default();
-        let distance = result["global_distance"].as_f64().unwrap_or_default();
-        say!(
-            "{:>4} {score:>6} {distance:>8.4}  {position:<22} {name}",
-            result["rank"]
-        )?;
+        print_result(result)?;
     }
     if results.is_empty() {
         say!("nothing in this map fits")?;
     }
-    if let (Some(matched), Some(confidence)) =
-        (answer["matched"].as_bool(), answer["confidence"].as_f64())
-    {
-        let verdict = if matched { "trusted" } else { "not trusted" };
-        say!("the best answer is {verdict}: confidence {confidence:.3}")?;
+    let matched = answer["matched"].as_bool();
+    let confidence = answer["confidence"].as_f64();
+    if let (Some(matched), Some(confidence)) = (matched, confidence) {
+        let trust = if matched { "trusted" } else { "not trusted" };
+        say!("the best answer is {trust}: confidence {confidence:.3}")?;
     }
-    let stages = answer["timings_ms"].as_object().into_iter().flatten();
-    let stages: Vec<String> = stages
-        .map(|(stage, ms)| format!("{stage} {:.1}", ms.as_f64().unwrap_or_default()))
-        .collect();
+    print_timings(answer)
+}
+
+fn print_result(result: &Value) -> Result<(), OutputError> {
+    let score = match result["spatial_score"].as_u64() {
+        Some(score) => score.to_string(),
+        None => "-".to_owned(),
+    };
+    let lat = result["location"]["lat"].as_f64();
+    let lon = result["location"]["lon"].as_f64();
+    let position = match (lat, lon) {
+        (Some(lat), Some(lon)) => format!("{lat:.6},{lon:.6}"),
+        _ => "-".to_owned(),
+    };
+    let external_id = result["external_id"].as_str();
+    let name = external_id.or(result["reference_id"].as_str());
+    let name = name.unwrap_or_default();
+    let distance = result["global_distance"].as_f64().unwrap_or_default();
+    let rank = &result["rank"];
+    say!("{rank:>4} {score:>6} {distance:>8.4}  {position:<22} {name}")
+}
+
+fn print_timings(answer: &Value) -> Result<(), OutputError> {
+    let mut stages = Vec::new();
+    for (stage, ms) in answer["timings_ms"].as_object().into_iter().flatten() {
+        stages.push(format!("{stage} {:.1}", ms.as_f64().unwrap_or_default()));
+    }
     let order = if answer["reranked"] == true {
         "re-ranked"
     } else {

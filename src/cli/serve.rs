@@ -1,11 +1,13 @@
 //! Run the service.
 
 use crate::cli::output::{say, say_part};
+use crate::cli::progress::ProgressBars;
 use crate::config::{Config, Overrides};
 use crate::ops::logging;
 use crate::server::{loaders, serve_until_signal};
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
@@ -29,15 +31,14 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
     }
     logging::init(&config.log)?;
     placeformer_kernels::self_check()?;
-    let loaders = loaders(&config);
+    let loaders = loaders(&config, Arc::new(ProgressBars::default()));
     serve_until_signal(config, loaders, print_address)?;
     Ok(())
 }
 
-/// Tells whoever started the server where it listens.
+/// Prints where the server listens.
 pub(super) fn print_address(address: SocketAddr) {
-    // The server outlives a reader of this line that has gone, so that a closed pipe is no reason
-    // to stop.
+    // Whoever started the server may have closed the pipe already, which is no reason to stop.
     if let Err(error) = say!("listening on http://{address}") {
         tracing::warn!(%error, %address, "the address was not printed");
     }

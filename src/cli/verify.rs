@@ -1,8 +1,10 @@
 //! Check every record of a store.
 
-use crate::cli::output::say;
+use crate::cli::output::{OutputError, say};
 use crate::config::{Config, Overrides};
 use anyhow::{Context, ensure};
+use placeformer_store::VerifyReport;
+use serde_json::json;
 use std::path::PathBuf;
 
 /// Arguments of this subcommand.
@@ -30,23 +32,9 @@ pub fn run(args: VerifyArgs) -> anyhow::Result<()> {
     let store = crate::server::open_store(&args.data, &config.store)?;
     let report = store.verify().context("the store cannot be read")?;
     if args.json {
-        let damaged: Vec<_> = report
-            .damaged
-            .iter()
-            .map(|(id, reason)| serde_json::json!({"reference": id, "reason": reason}))
-            .collect();
-        let report = serde_json::json!({
-            "references": report.references, "damaged": damaged, "engine_errors": report.engine_errors,
-        });
-        say!("{}", serde_json::to_string_pretty(&report)?)?;
+        print_json(&report)?;
     } else {
-        say!("{} references read", report.references)?;
-        for (id, reason) in &report.damaged {
-            say!("damaged: {id}: {reason}")?;
-        }
-        for error in &report.engine_errors {
-            say!("engine: {error}")?;
-        }
+        print_lines(&report)?;
     }
     let found = report.damaged.len() + report.engine_errors.len();
     ensure!(
@@ -54,5 +42,30 @@ pub fn run(args: VerifyArgs) -> anyhow::Result<()> {
         "{found} faults found; damaged references are quarantined and no longer served"
     );
     say!("all checksums hold")?;
+    Ok(())
+}
+
+fn print_json(report: &VerifyReport) -> anyhow::Result<()> {
+    let mut damaged = Vec::new();
+    for (id, reason) in &report.damaged {
+        damaged.push(json!({"reference": id, "reason": reason}));
+    }
+    let report = json!({
+        "references": report.references,
+        "damaged": damaged,
+        "engine_errors": report.engine_errors,
+    });
+    say!("{}", serde_json::to_string_pretty(&report)?)?;
+    Ok(())
+}
+
+fn print_lines(report: &VerifyReport) -> Result<(), OutputError> {
+    say!("{} references read", report.references)?;
+    for (id, reason) in &report.damaged {
+        say!("damaged: {id}: {reason}")?;
+    }
+    for error in &report.engine_errors {
+        say!("engine: {error}")?;
+    }
     Ok(())
 }

@@ -145,14 +145,8 @@ impl ApiKey {
                 ),
             )
         };
-        if self.sha256.len() != 64 || !self.sha256.is_ascii() {
-            return Err(wrong());
-        }
         let mut hash = [0; 32];
-        for (byte, digits) in hash.iter_mut().zip(self.sha256.as_bytes().chunks_exact(2)) {
-            let digits = std::str::from_utf8(digits).map_err(|_| wrong())?;
-            *byte = u8::from_str_radix(digits, 16).map_err(|_| wrong())?;
-        }
+        hex::decode_to_slice(&self.sha256, &mut hash).map_err(|_| wrong())?;
         Ok(hash)
     }
 }

@@ -13,7 +13,7 @@ use tower::ServiceExt;
 
 fn key(name: &str, role: Role) -> ApiKey {
     let hash = sha2::Sha256::digest(format!("key of {name}"));
-    let sha256 = hash.iter().map(|byte| format!("{byte:02x}")).collect();
+    let sha256 = hex::encode(hash);
     ApiKey {
         name: name.into(),
         sha256,

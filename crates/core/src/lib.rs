@@ -7,6 +7,8 @@
 //! | [`files`] | files that are written whole or not at all, and their hashes |
 //! | [`geography`] | positions, headings, UTM zones, and image names that carry UTM positions |
 //! | [`folder`] | the images below a folder |
+//! | [`progress`] | how far a long task has come |
+//! | [`retry`] | trying again what failed for a reason that may pass |
 //!
 //! Every other crate depends on this one and it depends on none of them. Nothing here decides how
 //! the service behaves. Only [`files`] and [`folder`] touch the disk.
@@ -16,4 +18,6 @@ pub mod files;
 pub mod folder;
 pub mod geography;
 mod invalid;
+pub mod progress;
+pub mod retry;
 pub mod types;

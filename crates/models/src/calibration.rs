@@ -14,8 +14,8 @@ pub fn built_in_calibration(model: &ModelId) -> Option<Calibration> {
 
 /// Every calibration that ships.
 pub fn built_in_calibrations() -> impl Iterator<Item = Calibration> {
-    // The files are part of the program, and a test reads every one of them, so that none is ever
-    // left out here.
+    // The files are part of the program and a test reads every one of them, so that none is left
+    // out here.
     BUILT_IN
         .iter()
         .filter_map(|text| serde_json::from_str(text).ok())

@@ -5,26 +5,42 @@
 //! that an interrupted download continues where it stopped and a changed file is never spliced onto
 //! an old beginning.
 
-use super::PullError;
-use indicatif::ProgressBar;
+mod download;
+
+use crate::error::PullError;
+use download::Download;
 use placeformer_core::files::{hash_file, with_suffix};
+use placeformer_core::progress::{Progress, Task};
+use placeformer_core::retry::{Retry, RetryPolicy, parse_retry_after};
 use reqwest::StatusCode;
-use reqwest::blocking::{Client, Response};
-use reqwest::header::{ACCEPT_ENCODING, CONTENT_LENGTH, ETAG, HeaderMap, LOCATION, RANGE};
-use std::fs::{File, OpenOptions};
-use std::io::{Read, Write};
+use reqwest::blocking::{Client, RequestBuilder, Response};
+use reqwest::header::{
+    ACCEPT_ENCODING, CONTENT_LENGTH, ETAG, HeaderMap, HeaderName, LOCATION, RETRY_AFTER,
+};
+use reqwest::redirect::Policy;
+use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Once;
 use std::time::Duration;
 
+/// Attempts at one request.
 const ATTEMPTS: u32 = 4;
+/// The longest pause between two attempts.
+const LONGEST_PAUSE: Duration = Duration::from_secs(60);
+/// Redirections followed for one request.
+const REDIRECTIONS: usize = 5;
+
+/// Hash of a large file, which the hub sends beside the redirect to its storage.
+const LINKED_ETAG: HeaderName = HeaderName::from_static("x-linked-etag");
+/// Size of a large file, sent likewise.
+const LINKED_SIZE: HeaderName = HeaderName::from_static("x-linked-size");
 
 /// Where the hub is and how to talk to it.
 #[derive(Debug, Clone)]
 pub struct Hub {
     endpoint: String,
     token: Option<String>,
-    /// Pause before the first retry; doubled each time.
-    pause: Duration,
+    retry: RetryPolicy,
 }
 
 /// What the hub says of a file.
@@ -47,12 +63,18 @@ impl Hub {
         Self::new(endpoint, set("HF_TOKEN"), Duration::from_millis(500))
     }
 
-    /// A hub at `endpoint`.
+    /// A hub at `endpoint`, which is asked again after `pause` when a request fails for a reason
+    /// that may pass. The pause doubles with every attempt.
     pub fn new(endpoint: impl Into<String>, token: Option<String>, pause: Duration) -> Self {
+        let retry = RetryPolicy {
+            attempts: ATTEMPTS,
+            first_wait: pause,
+            longest_wait: LONGEST_PAUSE,
+        };
         Self {
             endpoint: endpoint.into().trim_end_matches('/').to_owned(),
             token,
-            pause,
+            retry,
         }
     }
 
@@ -63,222 +85,131 @@ impl Hub {
 
     /// Downloads `file` of `repository` to a temporary file beside `target` and returns its path;
     /// the caller renames it once it has proved usable.
+    ///
+    /// # Errors
+    /// The hub cannot be reached, has no such file, or sends other bytes than its hash states; or
+    /// the temporary file cannot be written.
     pub fn fetch(
         &self,
         repository: &str,
         file: &str,
         target: &Path,
-        bar: &ProgressBar,
+        progress: &dyn Progress,
     ) -> Result<PathBuf, PullError> {
-        super::install_tls_provider();
+        install_tls_provider();
         let url = self.url(repository, file);
+        let task = Task::begin_bytes(progress, &url);
         let stated = self.retrying(|| self.ask(&url))?;
-        let tag: String = stated
-            .etag
-            .chars()
-            .filter(char::is_ascii_alphanumeric)
-            .take(16)
-            .collect();
-        let part = with_suffix(target, &format!(".{tag}.part"));
-        self.complete(&url, &part, &stated, bar)?;
-        if self.check(&part, &stated).is_err() {
-            // What was there before may be the culprit: once more from nothing.
+        let part = part_path(target, &stated.etag);
+        let download = Download {
+            hub: self,
+            url: &url,
+            part: &part,
+            size: stated.size,
+            task: &task,
+        };
+        download.complete()?;
+        if check(&part, &stated).is_err() {
+            // An earlier attempt may have left wrong bytes, so one more starts from nothing.
             remove(&part)?;
-            self.complete(&url, &part, &stated, bar)?;
-            self.check(&part, &stated)
-                .inspect_err(|_| drop(remove(&part)))?;
+            download.complete()?;
+            // The caller needs to know of the wrong hash, not of a removal that failed.
+            check(&part, &stated).inspect_err(|_| drop(remove(&part)))?;
         }
         Ok(part)
     }
 
-    fn client(&self, redirects: bool) -> Result<Client, PullError> {
-        let policy = if redirects {
-            reqwest::redirect::Policy::limited(5)
-        } else {
-            reqwest::redirect::Policy::none()
-        };
+    fn client(&self, redirects: Policy) -> Result<Client, PullError> {
         Client::builder()
             .user_agent(concat!("placeformer/", env!("CARGO_PKG_VERSION")))
             .connect_timeout(Duration::from_secs(10))
-            // Bounds each wait for data, not the whole transfer.
+            // This bounds each wait for data, not the whole transfer.
             .timeout(Duration::from_secs(60))
-            .redirect(policy)
+            .redirect(redirects)
             .build()
-            .map_err(|e| PullError::Http {
-                url: self.endpoint.clone(),
-                reason: chain(&e),
-                transient: false,
-            })
+            .map_err(|error| permanent(&self.endpoint, chain(&error)))
     }
 
     /// Size and hash of the file, from the hub itself rather than the storage it redirects to.
     fn ask(&self, url: &str) -> Result<Stated, PullError> {
-        let client = self.client(false)?;
+        let client = self.client(Policy::none())?;
         let mut address = url.to_owned();
-        for _ in 0..5 {
+        for _ in 0..REDIRECTIONS {
             // Without this a server may answer with the length of the compressed body.
-            let request = self.authorised(
-                client.head(&address).header(ACCEPT_ENCODING, "identity"),
-                &address,
-            );
-            let response = request.send().map_err(|e| broken(&address, &e))?;
-            let headers = response.headers();
+            let request = client.head(&address).header(ACCEPT_ENCODING, "identity");
+            let response = self.send(request, &address)?;
             let status = response.status();
-            let linked = headers.contains_key("x-linked-etag");
-            if status.is_success() || (status.is_redirection() && linked) {
+            let headers = response.headers();
+            let is_linked = headers.contains_key(&LINKED_ETAG);
+            if status.is_success() || (status.is_redirection() && is_linked) {
                 return stated(headers, url);
             }
-            // Renamed repositories answer with a relative address on the same host.
-            let moved = status
-                .is_redirection()
-                .then(|| header(headers, LOCATION.as_str()))
-                .flatten();
-            match moved {
-                Some(location) if location.starts_with('/') => {
-                    address = format!("{}{location}", self.endpoint)
-                }
-                Some(location) => address = location,
-                None => return Err(refused(&address, status)),
-            }
+            let location = header(headers, &LOCATION).filter(|_| status.is_redirection());
+            let Some(location) = location else {
+                return Err(refused(&address, &response));
+            };
+            address = self.absolute(location);
         }
-        Err(PullError::Http {
-            url: url.to_owned(),
-            reason: "too many redirections".into(),
-            transient: false,
-        })
+        Err(permanent(url, "too many redirections".into()))
     }
 
-    /// The token goes to the hub alone, never to a host it redirects to.
-    fn authorised(
-        &self,
-        request: reqwest::blocking::RequestBuilder,
-        url: &str,
-    ) -> reqwest::blocking::RequestBuilder {
-        match &self.token {
-            Some(token) if url.starts_with(&format!("{}/", self.endpoint)) => {
-                request.bearer_auth(token)
-            }
+    /// Renamed repositories answer with an address relative to the hub.
+    fn absolute(&self, location: String) -> String {
+        if location.starts_with('/') {
+            format!("{}{location}", self.endpoint)
+        } else {
+            location
+        }
+    }
+
+    /// Sends a request for `url`. The token goes to the hub alone, never to a host that the hub
+    /// redirects to.
+    fn send(&self, request: RequestBuilder, url: &str) -> Result<Response, PullError> {
+        let is_own = url.starts_with(&format!("{}/", self.endpoint));
+        let request = match &self.token {
+            Some(token) if is_own => request.bearer_auth(token),
             _ => request,
-        }
-    }
-
-    /// Brings `part` to its full length, continuing what is there.
-    fn complete(
-        &self,
-        url: &str,
-        part: &Path,
-        stated: &Stated,
-        bar: &ProgressBar,
-    ) -> Result<(), PullError> {
-        if let Some(size) = stated.size {
-            bar.set_length(size);
-        }
-        self.retrying(|| {
-            let mut file = OpenOptions::new()
-                .create(true)
-                .append(true)
-                .open(part)
-                .map_err(PullError::io(part))?;
-            let have = file.metadata().map_err(PullError::io(part))?.len();
-            if stated.size == Some(have) {
-                return Ok(());
-            }
-            if stated.size.is_some_and(|size| have > size) {
-                file.set_len(0).map_err(PullError::io(part))?;
-            }
-            let have = file.metadata().map_err(PullError::io(part))?.len();
-            let mut response = self.request_from(url, have)?;
-            if have > 0 && response.status() != StatusCode::PARTIAL_CONTENT {
-                // The server ignored the range and sends everything.
-                file.set_len(0).map_err(PullError::io(part))?;
-            }
-            bar.set_position(file.metadata().map_err(PullError::io(part))?.len());
-            copy(&mut response, &mut file, url, part, bar)?;
-            let have = file.metadata().map_err(PullError::io(part))?.len();
-            file.sync_all().map_err(PullError::io(part))?;
-            match stated.size {
-                Some(size) if have != size => Err(PullError::Http {
-                    url: url.to_owned(),
-                    reason: format!("the connection ended after {have} of {size} bytes"),
-                    transient: true,
-                }),
-                _ => Ok(()),
-            }
-        })
-    }
-
-    fn request_from(&self, url: &str, have: u64) -> Result<Response, PullError> {
-        let request = self
-            .client(true)?
-            .get(url)
-            .header(ACCEPT_ENCODING, "identity");
-        let request = if have > 0 {
-            request.header(RANGE, format!("bytes={have}-"))
-        } else {
-            request
         };
-        let response = self
-            .authorised(request, url)
-            .send()
-            .map_err(|e| broken(url, &e))?;
-        if response.status().is_success() {
-            Ok(response)
-        } else {
-            Err(refused(url, response.status()))
-        }
-    }
-
-    fn check(&self, part: &Path, stated: &Stated) -> Result<(), PullError> {
-        let Some(expected) = &stated.sha256 else {
-            return Ok(());
-        };
-        let actual = hash_file(part).map_err(PullError::io(part))?;
-        if actual == *expected {
-            return Ok(());
-        }
-        Err(PullError::WrongHash {
-            what: part.display().to_string(),
-            expected: expected.clone(),
-            actual,
-        })
+        request.send().map_err(|error| broken(url, &error))
     }
 
     /// Repeats what failed for a reason that may pass.
-    fn retrying<T>(
-        &self,
-        mut attempt: impl FnMut() -> Result<T, PullError>,
-    ) -> Result<T, PullError> {
-        let mut pause = self.pause;
-        for _ in 1..ATTEMPTS {
-            match attempt() {
-                Err(PullError::Http {
-                    transient: true,
-                    reason,
-                    url,
-                }) => {
-                    tracing::debug!(%url, %reason, "trying again");
-                    std::thread::sleep(pause);
-                    pause *= 2;
-                }
-                settled => return settled,
+    fn retrying<T>(&self, attempt: impl FnMut() -> Result<T, PullError>) -> Result<T, PullError> {
+        self.retry.run(attempt, |error| match error {
+            PullError::Http { url, reason, retry } => {
+                tracing::debug!(%url, %reason, ?retry, "the request failed");
+                *retry
             }
-        }
-        attempt()
+            _ => Retry::Never,
+        })
     }
 }
 
+/// Chooses the TLS implementation, once per process.
+fn install_tls_provider() {
+    static ONCE: Once = Once::new();
+    // Fails only if the process has chosen already, which serves as well.
+    ONCE.call_once(|| drop(rustls::crypto::ring::default_provider().install_default()));
+}
+
+/// The temporary file of one content: its name carries the start of the hash.
+fn part_path(target: &Path, etag: &str) -> PathBuf {
+    let tag: String = etag
+        .chars()
+        .filter(char::is_ascii_alphanumeric)
+        .take(16)
+        .collect();
+    with_suffix(target, &format!(".{tag}.part"))
+}
+
 fn stated(headers: &HeaderMap, url: &str) -> Result<Stated, PullError> {
-    let bare = |text: String| text.trim_start_matches("W/").trim_matches('"').to_owned();
-    let etag = header(headers, "x-linked-etag")
-        .or_else(|| header(headers, ETAG.as_str()))
-        .map(bare);
-    let size =
-        header(headers, "x-linked-size").or_else(|| header(headers, CONTENT_LENGTH.as_str()));
-    let etag = etag.ok_or_else(|| PullError::Http {
-        url: url.to_owned(),
-        reason: "the answer carries no ETag, so it is not a file of the hub".into(),
-        transient: false,
-    })?;
+    let etag = header(headers, &LINKED_ETAG).or_else(|| header(headers, &ETAG));
+    let Some(etag) = etag else {
+        let reason = "the answer carries no ETag, so it is not a file of the hub";
+        return Err(permanent(url, reason.into()));
+    };
+    let etag = etag.trim_start_matches("W/").trim_matches('"').to_owned();
+    let size = header(headers, &LINKED_SIZE).or_else(|| header(headers, &CONTENT_LENGTH));
     let is_sha256 = etag.len() == 64 && etag.bytes().all(|b| b.is_ascii_hexdigit());
     Ok(Stated {
         size: size.and_then(|size| size.parse().ok()),
@@ -287,64 +218,82 @@ fn stated(headers: &HeaderMap, url: &str) -> Result<Stated, PullError> {
     })
 }
 
-fn copy(
-    response: &mut Response,
-    file: &mut File,
-    url: &str,
-    part: &Path,
-    bar: &ProgressBar,
-) -> Result<(), PullError> {
-    let mut buffer = vec![0; 1 << 16];
-    loop {
-        let read = response.read(&mut buffer).map_err(|e| PullError::Http {
-            url: url.to_owned(),
-            reason: chain(&e),
-            transient: true,
-        })?;
-        if read == 0 {
-            return Ok(());
-        }
-        file.write_all(&buffer[..read])
-            .map_err(PullError::io(part))?;
-        bar.inc(read as u64);
+/// Compares the file with the hash that the hub stated, if it stated one.
+fn check(part: &Path, stated: &Stated) -> Result<(), PullError> {
+    let Some(expected) = &stated.sha256 else {
+        return Ok(());
+    };
+    let actual = hash_file(part).map_err(PullError::io(part))?;
+    if actual == *expected {
+        return Ok(());
     }
+    Err(PullError::WrongHash {
+        what: part.display().to_string(),
+        expected: expected.clone(),
+        actual,
+    })
 }
 
-fn header(headers: &HeaderMap, name: &str) -> Option<String> {
+fn header(headers: &HeaderMap, name: &HeaderName) -> Option<String> {
     headers.get(name)?.to_str().ok().map(str::to_owned)
 }
 
 fn remove(path: &Path) -> Result<(), PullError> {
-    std::fs::remove_file(path).map_err(PullError::io(path))
+    fs::remove_file(path).map_err(PullError::io(path))
 }
 
-fn refused(url: &str, status: StatusCode) -> PullError {
+/// An error that another attempt would meet again.
+fn permanent(url: &str, reason: String) -> PullError {
+    PullError::Http {
+        url: url.to_owned(),
+        reason,
+        retry: Retry::Never,
+    }
+}
+
+/// The error for an answer that is no success.
+fn refused(url: &str, response: &Response) -> PullError {
+    let status = response.status();
     let hint = match status {
         StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => {
             " (a private or gated repository needs HF_TOKEN)"
         }
         _ => "",
     };
-    let transient = status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS;
+    let may_pass = status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS;
+    let retry = if may_pass {
+        let after = header(response.headers(), &RETRY_AFTER);
+        Retry::Later {
+            after: after.as_deref().and_then(parse_retry_after),
+        }
+    } else {
+        Retry::Never
+    };
     PullError::Http {
         url: url.to_owned(),
         reason: format!("the server answered {status}{hint}"),
-        transient,
+        retry,
     }
 }
 
+/// The error for a request without an answer.
 fn broken(url: &str, error: &reqwest::Error) -> PullError {
     // A host that cannot be reached at all is reported at once: there is another source to try.
+    let retry = if error.is_connect() || error.is_builder() {
+        Retry::Never
+    } else {
+        Retry::Later { after: None }
+    };
     PullError::Http {
         url: url.to_owned(),
         reason: chain(error),
-        transient: !error.is_connect() && !error.is_builder(),
+        retry,
     }
 }
 
 /// An error with everything that caused it.
 fn chain(error: &dyn std::error::Error) -> String {
-    let causes =
-        std::iter::successors(Some(error), |error| error.source()).map(|error| error.to_string());
-    causes.collect::<Vec<_>>().join(": ")
+    let causes = std::iter::successors(Some(error), |error| error.source());
+    let causes: Vec<String> = causes.map(|error| error.to_string()).collect();
+    causes.join(": ")
 }

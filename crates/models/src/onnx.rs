@@ -1,8 +1,8 @@
 //! Just enough of ONNX to take a network's weights out of it: nodes by name, float initializers.
 //!
-//! The file is protocol-buffer encoded: ModelProto { 7: GraphProto { 1: node*, 5: initializer* } }.
-//! Everything else is skipped by wire type. Slices point into the file; nothing is copied until a
-//! tensor is asked for.
+//! The file is encoded as protocol buffers. The graph is field 7 of the model, and has nodes as
+//! field 1 and initializers as field 5. Every other field is skipped by its wire type. Names and
+//! values are slices of the file, so that nothing is copied before a tensor is asked for.
 
 /// The file breaks the encoding, or lacks what was asked for.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -42,8 +42,11 @@ pub struct Initializer<'a> {
 }
 
 impl Initializer<'_> {
-    /// Its values, row-major; an error unless they are 32-bit floats inside the file, as many as
-    /// the shape says.
+    /// Its values, row-major.
+    ///
+    /// # Errors
+    /// They are no 32-bit floats, they lie in another file, or they are not as many as the shape
+    /// says.
     pub fn floats(&self) -> Result<Vec<f32>, OnnxError> {
         const FLOAT: u64 = 1;
         let expected = self
@@ -51,9 +54,10 @@ impl Initializer<'_> {
             .iter()
             .try_fold(4usize, |bytes, &dim| bytes.checked_mul(dim));
         if self.data_type != FLOAT || self.external || Some(self.raw.len()) != expected {
-            let (kind, held) = (self.data_type, self.raw.len());
+            let kind = self.data_type;
+            let bytes = self.raw.len();
             let reason = format!(
-                "{} {:?} has type {kind} and {held} bytes in place",
+                "{} {:?} has type {kind} and {bytes} bytes in place",
                 self.name, self.dims
             );
             return Err(OnnxError(reason));
@@ -67,6 +71,9 @@ impl Initializer<'_> {
 }
 
 /// Reads the graph of an ONNX file.
+///
+/// # Errors
+/// The file is truncated, is not encoded as ONNX is, or holds no graph.
 pub fn parse(file: &[u8]) -> Result<Graph<'_>, OnnxError> {
     let mut graph = None;
     each_field(file, |number, value| {
@@ -127,6 +134,7 @@ fn parse_tensor(bytes: &[u8]) -> Result<Initializer<'_>, OnnxError> {
     Ok(tensor)
 }
 
+/// The value of one field, by its wire type.
 enum Value<'a> {
     Integer(u64),
     Bytes(&'a [u8]),

@@ -1,9 +1,12 @@
 //! The hub path against a local server that misbehaves on request.
 
 use super::*;
+use placeformer_core::progress::Silent;
+use placeformer_vision::extract::{Record, VitWeights, verify_weights};
 use sha2::{Digest, Sha256};
 use std::io::{BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -70,10 +73,11 @@ impl Mock {
         }
         let total = self.body.len();
         if head.starts_with("head") {
-            let (etag, close) = (&self.etag, "connection: close");
+            let etag = &self.etag;
             return write!(
                 stream,
-                "HTTP/1.1 302 Found\r\nlocation: /elsewhere\r\nx-linked-etag: \"{etag}\"\r\nx-linked-size: {total}\r\n{close}\r\n\r\n"
+                "HTTP/1.1 302 Found\r\nlocation: /elsewhere\r\nx-linked-etag: \"{etag}\"\r\n\
+                 x-linked-size: {total}\r\nconnection: close\r\n\r\n"
             );
         }
         let range = head.lines().find_map(|line| {
@@ -125,13 +129,14 @@ fn fetch(mock: &Mock, dir: &Path) -> Result<PathBuf, PullError> {
         "owner/model",
         "model.safetensors",
         &dir.join("model.safetensors"),
-        &ProgressBar::hidden(),
+        &Silent,
     )
 }
 
 #[test]
 fn a_file_arrives_whole() {
-    let (mock, dir) = (Mock::of(body()), tempfile::tempdir().unwrap());
+    let mock = Mock::of(body());
+    let dir = tempfile::tempdir().unwrap();
     let part = fetch(&mock, dir.path()).unwrap();
     assert_eq!(std::fs::read(part).unwrap(), body());
     assert!(
@@ -205,7 +210,8 @@ fn a_wrong_hash_is_refused_after_one_fresh_try_and_leaves_nothing() {
 
 #[test]
 fn a_spoiled_part_is_thrown_away_and_fetched_anew() {
-    let (mock, dir) = (Mock::of(body()), tempfile::tempdir().unwrap());
+    let mock = Mock::of(body());
+    let dir = tempfile::tempdir().unwrap();
     let part = fetch(&mock, dir.path()).unwrap();
     std::fs::write(&part, vec![0; 50_000]).unwrap();
     assert_eq!(
@@ -231,15 +237,11 @@ fn a_missing_file_fails_at_once_and_a_sick_server_after_some_tries() {
 
 #[test]
 fn the_token_is_sent_to_the_hub() {
-    let (mock, dir) = (Mock::of(body()), tempfile::tempdir().unwrap());
+    let mock = Mock::of(body());
+    let dir = tempfile::tempdir().unwrap();
     let hub = Hub::new(mock.start(), Some("secret".into()), Duration::ZERO);
-    hub.fetch(
-        "o/m",
-        "model.safetensors",
-        &dir.path().join("m"),
-        &ProgressBar::hidden(),
-    )
-    .unwrap();
+    hub.fetch("o/m", "model.safetensors", &dir.path().join("m"), &Silent)
+        .unwrap();
     assert!(
         mock.requests("")
             .iter()
@@ -249,7 +251,8 @@ fn the_token_is_sent_to_the_hub() {
 
 #[test]
 fn what_is_not_the_model_never_reaches_the_cache() {
-    let (mock, dir) = (Mock::of(body()), tempfile::tempdir().unwrap());
+    let mock = Mock::of(body());
+    let dir = tempfile::tempdir().unwrap();
     let target = dir.path().join("model.safetensors");
     let hub = hub(mock.start());
     let puller = Puller {
@@ -259,7 +262,7 @@ fn what_is_not_the_model_never_reaches_the_cache() {
         wheel: false,
         offline: false,
     };
-    let error = puller.pull(false).unwrap_err().to_string();
+    let error = puller.pull(false, &Silent).unwrap_err().to_string();
     assert!(
         error.contains("dinov2-vits14 could not be fetched") && error.contains("safetensors"),
         "{error}"
@@ -280,7 +283,7 @@ fn an_unreachable_hub_is_named_in_the_message() {
         wheel: false,
         offline: false,
     }
-    .pull(false)
+    .pull(false, &Silent)
     .unwrap_err()
     .to_string();
     assert!(
@@ -314,7 +317,10 @@ fn a_damaged_cached_model_is_noticed() {
         offline: false,
     };
     assert!(
-        matches!(puller.pull(false), Err(PullError::AllFailed { .. })),
+        matches!(
+            puller.pull(false, &Silent),
+            Err(PullError::AllFailed { .. })
+        ),
         "it must try to fetch it again"
     );
 }
@@ -324,7 +330,9 @@ fn zero_weights() -> VitWeights {
     use placeformer_vision::extract::{BlockWeights, Linear, Norm};
     let preset = Preset::Dinov2Vits14;
     let geometry = preset.geometry();
-    let (dim, mlp, position_grid) = (geometry.dim, geometry.mlp_dim, (37, 37));
+    let dim = geometry.dim;
+    let mlp = geometry.mlp_dim;
+    let position_grid = (37, 37);
     let linear = |from: usize, to: usize| Linear {
         weight: vec![0.0; from * to],
         bias: vec![0.0; to],
@@ -373,7 +381,7 @@ fn well_formed_weights_that_are_not_the_presets_count_as_a_source_that_failed() 
         wheel: false,
         offline: false,
     }
-    .pull(false)
+    .pull(false, &Silent)
     .unwrap_err();
     let PullError::AllFailed { tried, .. } = &error else {
         panic!("the next source would not be tried: {error}")

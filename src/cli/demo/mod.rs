@@ -10,6 +10,7 @@ mod report;
 use super::client::{ServerArgs, ServerClient};
 use crate::cli::child_server::ChildServer;
 use crate::cli::output::say;
+use crate::cli::progress::ProgressBars;
 use anyhow::{Context, bail, ensure};
 use placeformer_models::resolve_weights;
 use placeformer_vision::extract::ExtractConfig;
@@ -52,7 +53,8 @@ pub struct DemoArgs {
 pub fn run(args: DemoArgs) -> anyhow::Result<()> {
     let town = args.out.join("town");
     prepare(&args.out)?;
-    resolve_weights(&ExtractConfig::default()).context("the demo needs the default model")?;
+    resolve_weights(&ExtractConfig::default(), &ProgressBars::default())
+        .context("the demo needs the default model")?;
 
     say!(
         "\n1. Draw a town of {} places, {} photos each",

@@ -5,6 +5,7 @@ mod calibrate;
 use super::data_args::ReadArgs;
 use super::model_args::ModelOptions;
 use crate::cli::output::say_part;
+use crate::cli::progress::ProgressBars;
 use anyhow::{Context, bail, ensure};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use placeformer_core::types::{Calibration, ModelId, ScaleSet};
@@ -339,7 +340,7 @@ struct Answered {
 
 fn describer(config: &ExtractConfig) -> anyhow::Result<ModelDescriber> {
     Ok(ModelDescriber {
-        extractor: open_extractor(config)?,
+        extractor: open_extractor(config, &ProgressBars::default())?,
         limits: ImageConfig::default(),
     })
 }

@@ -1,5 +1,5 @@
-//! Where, whither and when a photo was taken: from the positions file, else from its name, else
-//! from its EXIF.
+//! Position, heading and time of a photo: from the positions file, else from its name, else from
+//! its EXIF.
 //!
 //! Each field is taken from the first source that has it.
 
@@ -12,9 +12,11 @@ use std::path::Path;
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
-/// All that is known beside the photos themselves.
+/// What is known of the photos from other sources than their content.
 pub(super) struct Metadata {
+    /// The rows of the positions file by the photo's name.
     rows: HashMap<String, Row>,
+    /// The zone of names that carry a UTM position without one.
     zone: Option<UtmZone>,
     require_position: bool,
 }
@@ -27,6 +29,7 @@ struct Row {
 }
 
 impl Row {
+    /// Each field of this row, or that of `other` where this one has none.
     fn or(self, other: Self) -> Self {
         Self {
             location: self.location.or(other.location),
@@ -37,24 +40,22 @@ impl Row {
 }
 
 impl Metadata {
-    /// Reads the positions file, if there is one. Its rows name photos of `folder` from there, or
-    /// from where the file itself lies.
+    /// Reads the positions file, if there is one. Its rows name photos by their path from `folder`
+    /// or from the folder in which the file itself lies.
     pub(super) fn read(
         positions: Option<&Path>,
         folder: &Path,
         zone: Option<UtmZone>,
         require_position: bool,
     ) -> anyhow::Result<Self> {
-        let read = |path: &Path| {
-            read_positions(path).with_context(|| format!("cannot use {}", path.display()))
+        let rows = match positions {
+            Some(path) => {
+                let rows = read_positions(path)
+                    .with_context(|| format!("cannot use {}", path.display()))?;
+                named_from(folder, path, rows)
+            }
+            None => HashMap::new(),
         };
-        let mut rows = positions.map(read).transpose()?.unwrap_or_default();
-        if let Some(prefix) = positions.and_then(|path| way_down(path, folder)) {
-            rows = rows
-                .into_iter()
-                .map(|(file, row)| (file.strip_prefix(&prefix).unwrap_or(&file).into(), row))
-                .collect();
-        }
         Ok(Self {
             rows,
             zone,
@@ -82,83 +83,98 @@ impl Metadata {
         external_id: ExternalId,
         image: &[u8],
     ) -> Result<ReferenceFields, String> {
-        let exif = read_exif(image);
-        let exif = Row {
-            location: exif.location,
-            heading: exif.heading,
-            captured_at: exif.captured_at,
-        };
-        let named = UtmName::parse(name).map(|parsed| Row {
-            location: parsed.location(self.zone),
-            heading: parsed.heading,
-            captured_at: parsed.captured_at,
-        });
         let listed = self.rows.get(name).copied().unwrap_or_default();
-        let Row {
-            location,
-            heading,
-            captured_at,
-        } = listed.or(named.unwrap_or_default()).or(exif);
-        if self.require_position && location.is_none() {
+        let named = self.row_of_name(name).unwrap_or_default();
+        let row = listed.or(named).or(from_exif(image));
+        if self.require_position && row.location.is_none() {
             return Err("no position in the positions file, the name or the EXIF".into());
         }
         Ok(ReferenceFields {
             external_id: Some(external_id),
-            location,
-            heading,
-            captured_at,
+            location: row.location,
+            heading: row.heading,
+            captured_at: row.captured_at,
             metadata: None,
+        })
+    }
+
+    /// What the name says, if it is one of the UTM names.
+    fn row_of_name(&self, name: &str) -> Option<Row> {
+        let parsed = UtmName::parse(name).ok()?;
+        Some(Row {
+            location: parsed.location(self.zone),
+            heading: parsed.heading,
+            captured_at: parsed.captured_at,
         })
     }
 }
 
-/// From the folder of `file` down to `folder`, with a slash at the end; `None` if it does not lie
-/// below.
-fn way_down(file: &Path, folder: &Path) -> Option<String> {
-    let (from, to) = (
-        file.parent()?.canonicalize().ok()?,
-        folder.canonicalize().ok()?,
-    );
-    let way = to.strip_prefix(from).ok()?.to_str()?.replace('\\', "/");
-    (!way.is_empty()).then(|| way + "/")
+fn from_exif(image: &[u8]) -> Row {
+    let exif = read_exif(image);
+    Row {
+        location: exif.location,
+        heading: exif.heading,
+        captured_at: exif.captured_at,
+    }
 }
 
+/// Renames rows whose names begin at the folder of the positions file to names below `folder`.
+fn named_from(folder: &Path, positions: &Path, rows: HashMap<String, Row>) -> HashMap<String, Row> {
+    let Some(prefix) = path_down(positions, folder) else {
+        return rows;
+    };
+    rows.into_iter()
+        .map(|(file, row)| match file.strip_prefix(&prefix) {
+            Some(name) => (name.to_owned(), row),
+            None => (file, row),
+        })
+        .collect()
+}
+
+/// The path from the folder of `file` down to `folder`, with a slash at the end; `None` if `folder`
+/// does not lie below.
+fn path_down(file: &Path, folder: &Path) -> Option<String> {
+    let from = file.parent()?.canonicalize().ok()?;
+    let to = folder.canonicalize().ok()?;
+    let path = to.strip_prefix(from).ok()?.to_str()?.replace('\\', "/");
+    (!path.is_empty()).then(|| path + "/")
+}
+
+/// Reads the rows of a positions file, by the name of their photo.
 fn read_positions(path: &Path) -> anyhow::Result<HashMap<String, Row>> {
     let bytes = std::fs::read(path)?;
+    // Spreadsheets begin their files with a byte order mark.
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
     let mut reader = csv::ReaderBuilder::new()
         .trim(csv::Trim::All)
         .from_reader(bytes);
     let headers = reader.headers()?.clone();
-    let known = ["file", "lat", "lon", "heading", "captured_at"];
-    if let Some(unknown) = headers.iter().find(|header| !known.contains(header)) {
-        bail!("column {unknown:?} is not one of {}", known.join(", "));
-    }
-    ensure!(
-        headers.iter().any(|header| header == "file"),
-        "there is no column \"file\""
-    );
+    check_columns(&headers)?;
     let mut rows = HashMap::new();
     for record in reader.records() {
         let record = record?;
         let line = record.position().map_or(0, csv::Position::line);
         let field = |name: &str| {
-            let text = headers
-                .iter()
-                .position(|header| header == name)
-                .and_then(|column| record.get(column));
-            text.filter(|text| !text.is_empty())
+            let column = headers.iter().position(|header| header == name)?;
+            record.get(column).filter(|text| !text.is_empty())
         };
-        let file = field("file")
-            .ok_or_else(|| anyhow!("line {line}: file is empty"))?
-            .replace('\\', "/");
+        let file = field("file").ok_or_else(|| anyhow!("line {line}: file is empty"))?;
+        let file = file.replace('\\', "/");
         let row = parse_row(&field).with_context(|| format!("line {line}"))?;
-        ensure!(
-            rows.insert(file.clone(), row).is_none(),
-            "line {line}: {file:?} has a row already"
-        );
+        let earlier = rows.insert(file.clone(), row);
+        ensure!(earlier.is_none(), "line {line}: {file:?} has a row already");
     }
     Ok(rows)
+}
+
+fn check_columns(headers: &csv::StringRecord) -> anyhow::Result<()> {
+    let known = ["file", "lat", "lon", "heading", "captured_at"];
+    if let Some(unknown) = headers.iter().find(|header| !known.contains(header)) {
+        bail!("column {unknown:?} is not one of {}", known.join(", "));
+    }
+    let has_file = headers.iter().any(|header| header == "file");
+    ensure!(has_file, "there is no column \"file\"");
+    Ok(())
 }
 
 fn parse_row<'a>(field: &impl Fn(&str) -> Option<&'a str>) -> anyhow::Result<Row> {
@@ -234,7 +250,8 @@ mod tests {
 
     #[test]
     fn rows_come_first_then_names() {
-        let csv = "\u{feff}file,lat,lon,heading,captured_at\r\na\\b.jpg,45.5,12.25,-90,2026-05-17T09:30:00Z\r\n\
+        let csv = "\u{feff}file,lat,lon,heading,captured_at\r\n\
+                   a\\b.jpg,45.5,12.25,-90,2026-05-17T09:30:00Z\r\n\
                    @500000@5000000@@@@@@@123@.jpg,,,10,\r\n";
         let metadata = read(csv).unwrap();
         let fields = metadata.fields("a/b.jpg", id(), b"").unwrap();

@@ -1,30 +1,33 @@
 //! Import a folder of photos into a map.
 //!
-//! Through a running server or straight into a store: both are a [`Sink`]. Each photo's external id
-//! is its path below the folder. What the map holds already, with the same content, is skipped, so
-//! an interrupted import is resumed by running it again. Every photo gets a verdict: a line of the
-//! JSONL report, a place in the summary; the exit code tells whether all are in.
+//! An import goes through a running server or straight into a store; both are a [`Sink`]. Each
+//! photo's external id is its path below the folder. Photos that the map has already, with the same
+//! content, are skipped, so that an interrupted import is resumed by running it again. Every photo
+//! gets a line in the JSONL report and a place in the summary, and the exit code tells whether all
+//! of them are in the map.
 
-mod http_sink;
+mod importer;
 mod metadata;
+mod report;
+mod server_sink;
 mod sink;
 mod store_sink;
-mod verdict;
 
+use crate::cli::client::ServerArgs;
 use crate::cli::output::say;
+use crate::cli::progress::ProgressBars;
 use crate::config::ModelOverrides;
 use anyhow::{Context, bail, ensure};
-use indicatif::{ProgressBar, ProgressStyle};
+use importer::Importer;
 use metadata::Metadata;
 use placeformer_core::folder::list_images;
 use placeformer_core::geography::UtmZone;
-use placeformer_core::types::{ContentHash, ExternalId, MapName};
-use sink::{Outcome, Sink, Upload};
-use std::collections::HashMap;
-use std::path::{Path, PathBuf};
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use verdict::{Status, Verdict, VerdictLog};
+use placeformer_core::types::MapName;
+use report::{ImportReport, Summary};
+use server_sink::ServerSink;
+use sink::Sink;
+use std::path::PathBuf;
+use store_sink::StoreSink;
 
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
@@ -93,293 +96,90 @@ pub fn run(args: ImportArgs) -> anyhow::Result<()> {
         "{} holds no JPEG, PNG or WebP image",
         args.folder.display()
     );
+    let metadata = read_metadata(&args, &images)?;
+    let (summary, stopped) = import(&args, &images, &metadata)?;
+    say!("{summary}")?;
+    if let Some(reason) = stopped {
+        bail!("stopped: {reason}");
+    }
+    let failed = summary.failed;
+    ensure!(
+        failed == 0,
+        "{failed} of {} photos are not in the map",
+        images.len()
+    );
+    Ok(())
+}
+
+/// What is known of the photos from other files than their own.
+fn read_metadata(args: &ImportArgs, images: &[(String, PathBuf)]) -> anyhow::Result<Metadata> {
     let metadata = Metadata::read(
         args.positions.as_deref(),
         &args.folder,
         args.utm_zone,
         args.require_position,
     )?;
-    let unmatched = metadata.without_image(images.iter().map(|(name, _)| name.as_str()));
+    let names = images.iter().map(|(name, _)| name.as_str());
+    let unmatched = metadata.without_image(names);
     if let Some(example) = unmatched.first() {
-        eprintln!(
-            "warning: {} rows of the positions file name no image, such as {example:?}",
-            unmatched.len()
-        );
+        let count = unmatched.len();
+        eprintln!("warning: {count} rows of the positions file name no image, such as {example:?}");
     }
-    let log = VerdictLog::create(args.report.as_deref())?;
-    let sink = open_sink(&args)?;
+    Ok(metadata)
+}
+
+/// Imports all photos; returns the counts, and why the import stopped if it did before the end.
+fn import(
+    args: &ImportArgs,
+    images: &[(String, PathBuf)],
+    metadata: &Metadata,
+) -> anyhow::Result<(Summary, Option<String>)> {
+    let report = ImportReport::create(args.report.as_deref())?;
+    let sink = open_sink(args)?;
     let present = sink
         .present(&args.map)
         .context("cannot list what the map holds")?;
-    let progress = progress_bar(images.len() as u64);
-    let import = Import {
+    let importer = Importer {
         sink: &*sink,
-        metadata: &metadata,
+        metadata,
         map: &args.map,
         present: &present,
-        log: &log,
+        report: &report,
+        progress: &ProgressBars::default(),
     };
-    let stopped = import.run(&images, args.concurrency, &progress);
-    progress.finish_and_clear();
-    let summary = log.finish()?;
-    say!("{summary}")?;
-    if let Some(reason) = stopped {
-        bail!("stopped: {reason}");
-    }
-    ensure!(
-        summary.failed == 0,
-        "{} of {} photos are not in the map",
-        summary.failed,
-        images.len()
-    );
-    Ok(())
+    let stopped = importer.run(images, args.concurrency);
+    Ok((report.finish()?, stopped))
 }
 
 fn open_sink(args: &ImportArgs) -> anyhow::Result<Box<dyn Sink>> {
-    match (&args.server, &args.data) {
-        (Some(url), _) => {
-            let ModelOverrides {
-                preset,
-                weights: _,
-                head,
-                precision,
-            } = &args.model;
-            let given = preset.is_some() || head.is_some() || precision.is_some();
-            ensure!(
-                !given,
-                "--preset, --head and --precision go with --data: a server has its own model"
-            );
-            let settings = http_sink::Settings {
-                url: url.clone(),
-                api_key: args.api_key.clone(),
-                timeout: std::time::Duration::from_secs(args.timeout),
-                attempts: args.attempts,
-            };
-            Ok(Box::new(http_sink::HttpSink::new(settings)?))
-        }
-        (None, Some(data)) => Ok(Box::new(store_sink::StoreSink::open(
-            data,
-            args.config.as_deref(),
-            args.model.clone(),
-        )?)),
-        (None, None) => bail!("give --server or --data"),
+    if let Some(server) = &args.server {
+        refuse_model_options(&args.model)?;
+        let server = ServerArgs {
+            server: server.clone(),
+            api_key: args.api_key.clone(),
+            timeout: args.timeout,
+        };
+        return Ok(Box::new(ServerSink::new(server, args.attempts)?));
     }
+    let Some(data) = &args.data else {
+        bail!("give --server or --data");
+    };
+    let sink = StoreSink::open(data, args.config.as_deref(), args.model.clone())?;
+    Ok(Box::new(sink))
 }
 
-fn progress_bar(length: u64) -> ProgressBar {
-    let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} {per_sec} {eta} {msg}")
-        .unwrap_or_else(|_| ProgressStyle::default_bar());
-    ProgressBar::new(length).with_style(style)
-}
-
-struct Import<'a> {
-    sink: &'a dyn Sink,
-    metadata: &'a Metadata,
-    map: &'a MapName,
-    /// Content by external id.
-    present: &'a HashMap<String, String>,
-    log: &'a VerdictLog,
-}
-
-impl Import<'_> {
-    /// Imports all images from `concurrency` threads; says why if it had to stop before the end.
-    fn run(
-        &self,
-        images: &[(String, PathBuf)],
-        concurrency: usize,
-        progress: &ProgressBar,
-    ) -> Option<String> {
-        let (next, stop) = (AtomicUsize::new(0), AtomicBool::new(false));
-        let reason = Mutex::new(None);
-        std::thread::scope(|scope| {
-            for _ in 0..concurrency.min(images.len()) {
-                scope.spawn(|| {
-                    while !stop.load(Ordering::Relaxed) {
-                        let Some((name, path)) = images.get(next.fetch_add(1, Ordering::Relaxed))
-                        else {
-                            break;
-                        };
-                        let (verdict, hopeless) = self.import(name, path);
-                        if verdict.status == Status::Failed {
-                            progress.suspend(|| {
-                                eprintln!(
-                                    "{name}: {}",
-                                    verdict.detail.as_deref().unwrap_or("failed")
-                                )
-                            });
-                        }
-                        let logged = self.log.add(&verdict);
-                        progress.inc(1);
-                        if hopeless || logged.is_err() {
-                            let why = logged
-                                .err()
-                                .map(|error| format!("cannot write the report: {error}"))
-                                .or(verdict.detail);
-                            // A poisoned lock means another thread panicked; its reason is as good.
-                            reason
-                                .lock()
-                                .unwrap_or_else(|poisoned| poisoned.into_inner())
-                                .get_or_insert(why.unwrap_or_default());
-                            stop.store(true, Ordering::Relaxed);
-                        }
-                    }
-                });
-            }
-        });
-        reason
-            .into_inner()
-            .unwrap_or_else(|poisoned| poisoned.into_inner())
-    }
-
-    /// The verdict on one image, and whether going on is hopeless.
-    fn import(&self, name: &str, path: &Path) -> (Verdict, bool) {
-        let failed = |code: &str, detail: String| (Verdict::failed(name, code, detail, 0), false);
-        let external_id: ExternalId = match name.parse() {
-            Ok(id) => id,
-            Err(error) => return failed("invalid_parameter", format!("{error}")),
-        };
-        let bytes = match std::fs::read(path) {
-            Ok(bytes) => bytes,
-            Err(error) => return failed("unreadable_file", error.to_string()),
-        };
-        let hash = ContentHash::of(&bytes).to_string();
-        match self.present.get(name) {
-            Some(present) if *present == hash => return (Verdict::skipped(name), false),
-            Some(_) => {
-                let detail = "the map holds another image under this name; delete it there or rename this one";
-                return failed("external_id_conflict", detail.into());
-            }
-            None => {}
-        }
-        let fields = match self.metadata.fields(name, external_id, &bytes) {
-            Ok(fields) => fields,
-            Err(detail) => return failed("no_position", detail),
-        };
-        let located = fields.location.is_some();
-        let sent = self.sink.send(Upload {
-            map: self.map.clone(),
-            fields,
-            image: bytes.into(),
-        });
-        match sent.outcome {
-            Outcome::Created(id) => (
-                Verdict::stored(name, Status::Created, id, located, sent.attempts),
-                false,
-            ),
-            Outcome::Present(id) => (
-                Verdict::stored(name, Status::Present, id, located, sent.attempts),
-                false,
-            ),
-            Outcome::Refused { code, detail } => (
-                Verdict::failed(name, &code, detail, sent.attempts),
-                sink::is_hopeless(&code),
-            ),
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::sink::Sent;
-    use super::*;
-
-    /// Keeps what it is sent; refuses images that start with `!`, with the code that follows.
-    #[derive(Default)]
-    struct Memory(Mutex<HashMap<String, String>>);
-
-    impl Sink for Memory {
-        fn present(&self, _map: &MapName) -> anyhow::Result<HashMap<String, String>> {
-            Ok(self.0.lock().unwrap().clone())
-        }
-
-        fn send(&self, upload: Upload) -> Sent {
-            if let Some(code) = upload.image.strip_prefix(b"!") {
-                let code = String::from_utf8_lossy(code).into_owned();
-                return Sent {
-                    outcome: Outcome::Refused {
-                        code,
-                        detail: "refused".into(),
-                    },
-                    attempts: 1,
-                };
-            }
-            let id = upload.fields.external_id.unwrap().to_string();
-            self.0
-                .lock()
-                .unwrap()
-                .insert(id, ContentHash::of(&upload.image).to_string());
-            Sent {
-                outcome: Outcome::Created("id".into()),
-                attempts: 1,
-            }
-        }
-    }
-
-    fn import(folder: &Path, sink: &Memory, report: &Path) -> (verdict::Summary, Option<String>) {
-        let images = list_images(folder).unwrap();
-        let metadata = Metadata::read(None, Path::new("."), None, false).unwrap();
-        let map = "m".parse().unwrap();
-        let present = sink.present(&map).unwrap();
-        let log = VerdictLog::create(Some(report)).unwrap();
-        let import = Import {
-            sink,
-            metadata: &metadata,
-            map: &map,
-            present: &present,
-            log: &log,
-        };
-        let stopped = import.run(&images, 3, &ProgressBar::hidden());
-        (log.finish().unwrap(), stopped)
-    }
-
-    #[test]
-    fn a_second_import_skips_what_is_there_and_reports_what_changed() {
-        let folder = tempfile::tempdir().unwrap();
-        let photos = folder.path().join("photos");
-        std::fs::create_dir_all(photos.join("sub")).unwrap();
-        for name in ["a.jpg", "b.jpg", "sub/c.png"] {
-            std::fs::write(photos.join(name), name).unwrap();
-        }
-        std::fs::write(photos.join("bad.jpg"), b"!image_undecodable").unwrap();
-        let (sink, report) = (Memory::default(), folder.path().join("report.jsonl"));
-        let (summary, stopped) = import(&photos, &sink, &report);
-        assert_eq!((summary.created, summary.failed, stopped), (3, 1, None));
-        std::fs::write(photos.join("b.jpg"), "other").unwrap();
-        std::fs::remove_file(photos.join("bad.jpg")).unwrap();
-        std::fs::write(photos.join("d.jpg"), "new").unwrap();
-        let (summary, _) = import(&photos, &sink, &report);
-        assert_eq!(
-            (summary.created, summary.skipped, summary.failed),
-            (1, 2, 1)
-        );
-        let lines: Vec<serde_json::Value> = std::fs::read_to_string(&report)
-            .unwrap()
-            .lines()
-            .map(|line| serde_json::from_str(line).unwrap())
-            .collect();
-        assert_eq!(lines.len(), 4);
-        let changed = lines.iter().find(|line| line["file"] == "b.jpg").unwrap();
-        assert_eq!(
-            (&changed["status"], &changed["code"]),
-            (&"failed".into(), &"external_id_conflict".into())
-        );
-    }
-
-    #[test]
-    fn what_holds_for_every_image_stops_the_import() {
-        let folder = tempfile::tempdir().unwrap();
-        for i in 0..50 {
-            std::fs::write(
-                folder.path().join(format!("{i:02}.jpg")),
-                b"!model_mismatch",
-            )
-            .unwrap();
-        }
-        let report = folder.path().join("report.jsonl");
-        let (summary, stopped) = import(folder.path(), &Memory::default(), &report);
-        assert!(
-            summary.failed <= 3 && stopped.is_some(),
-            "{summary} {stopped:?}"
-        );
-    }
+/// A server has its own model. `--weights` is let through, because the environment sets it, too.
+fn refuse_model_options(model: &ModelOverrides) -> anyhow::Result<()> {
+    let ModelOverrides {
+        preset,
+        weights: _,
+        head,
+        precision,
+    } = model;
+    let is_given = preset.is_some() || head.is_some() || precision.is_some();
+    ensure!(
+        !is_given,
+        "--preset, --head and --precision go with --data: a server has its own model"
+    );
+    Ok(())
 }

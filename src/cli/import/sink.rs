@@ -1,5 +1,6 @@
 //! Where an import puts its photos.
 
+use crate::cli::client::UNREACHABLE;
 use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{MapName, ReferenceFields};
@@ -9,6 +10,7 @@ use std::collections::HashMap;
 pub(super) struct Upload {
     pub(super) map: MapName,
     pub(super) fields: ReferenceFields,
+    /// The file's bytes.
     pub(super) image: Bytes,
 }
 
@@ -37,14 +39,15 @@ pub(super) struct Sent {
 
 /// Takes photos from several threads at once.
 pub(super) trait Sink: Sync {
-    /// SHA-256 in hexadecimal by external id of all that the map holds; nothing if there is no such
-    /// map.
+    /// What the map has: the SHA-256 of the content, in hexadecimal, by external id. A map that
+    /// does not exist has nothing.
     fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, String>>;
+
     /// Stores one photo; tries again itself where that may help.
     fn send(&self, upload: Upload) -> Sent;
 }
 
-/// Whether an error would meet every other photo too.
+/// Whether every other photo would fail with this code, too.
 pub(super) fn is_hopeless(code: &str) -> bool {
     let hopeless = [
         ErrorCode::Unauthorized,
@@ -56,6 +59,3 @@ pub(super) fn is_hopeless(code: &str) -> bool {
     ];
     code == UNREACHABLE || hopeless.iter().any(|known| known.as_str() == code)
 }
-
-/// The code for a server that never answered.
-pub(super) const UNREACHABLE: &str = "unreachable";

@@ -1,6 +1,7 @@
-//! Straight into a store, through the same pipeline as the server, without the server.
+//! An import straight into a store: the pipeline of the server without the server.
 
 use super::sink::{Outcome, Sent, Sink, Upload};
+use crate::cli::progress::ProgressBars;
 use crate::config::{Config, ModelOverrides, Overrides};
 use crate::ops::{Health, Metrics};
 use crate::pipeline::{IngestRequest, Parts, PipelineError, Service};
@@ -8,7 +9,7 @@ use anyhow::Context;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{MapName, ReferenceId};
 use placeformer_models::open_extractor;
-use placeformer_store::SqliteStore;
+use placeformer_store::{Page, SqliteStore};
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -24,8 +25,8 @@ pub(super) struct StoreSink {
 const PAGE: usize = 1000;
 
 impl StoreSink {
-    /// Loads the model and opens the store in `data` with the settings of `config`, `model` above
-    /// them.
+    /// Loads the model and opens the store in `data` with the settings of `config`, which `model`
+    /// overrides.
     pub(super) fn open(
         data: &Path,
         config: Option<&Path>,
@@ -38,7 +39,8 @@ impl StoreSink {
         };
         let config = Config::load(config, &overrides)?;
         placeformer_kernels::self_check()?;
-        let extractor = open_extractor(&config.extract).context("cannot load the model")?;
+        let extractor = open_extractor(&config.extract, &ProgressBars::default())
+            .context("cannot load the model")?;
         let store = SqliteStore::open(data, &config.store)?;
         let service = Service::start(Parts {
             store: Arc::new(store),
@@ -55,13 +57,9 @@ impl StoreSink {
         Ok(Self { service, runtime })
     }
 
-    fn page(
-        &self,
-        map: &MapName,
-        after: Option<ReferenceId>,
-    ) -> Result<placeformer_store::Page, PipelineError> {
-        self.runtime
-            .block_on(self.service.references(Some(map.clone()), after, PAGE))
+    fn page(&self, map: &MapName, after: Option<ReferenceId>) -> Result<Page, PipelineError> {
+        let page = self.service.references(Some(map.clone()), after, PAGE);
+        self.runtime.block_on(page)
     }
 }
 
@@ -90,18 +88,15 @@ impl Sink for StoreSink {
 
     fn send(&self, upload: Upload) -> Sent {
         let Upload { map, fields, image } = upload;
-        let outcome =
-            match self
-                .runtime
-                .block_on(self.service.ingest(IngestRequest { map, fields, image }))
-            {
-                Ok(answer) if answer.created => Outcome::Created(answer.reference.id.to_string()),
-                Ok(answer) => Outcome::Present(answer.reference.id.to_string()),
-                Err(error) => Outcome::Refused {
-                    code: error.code().as_str().into(),
-                    detail: format!("{:#}", anyhow::Error::new(error)),
-                },
-            };
+        let request = IngestRequest { map, fields, image };
+        let outcome = match self.runtime.block_on(self.service.ingest(request)) {
+            Ok(answer) if answer.created => Outcome::Created(answer.reference.id.to_string()),
+            Ok(answer) => Outcome::Present(answer.reference.id.to_string()),
+            Err(error) => Outcome::Refused {
+                code: error.code().as_str().into(),
+                detail: format!("{:#}", anyhow::Error::new(error)),
+            },
+        };
         Sent {
             outcome,
             attempts: 1,

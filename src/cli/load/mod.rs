@@ -1,23 +1,29 @@
 //! Drive a server at a constant rate and report what its clients felt.
 //!
-//! Open loop: request *i* is due at `start + i / rate` whether or not earlier answers have come
-//! back, and its latency counts from the moment it was *due*. A closed-loop client slows down with
-//! the server and so hides the queue that real vehicles would stand in (coordinated omission); this
-//! one does not.
+//! The load is an open loop: request *i* is due at `start + i / rate` whether or not earlier
+//! answers have come back, and its latency counts from the moment it was *due*. A closed-loop
+//! client slows down with the server and so hides the queue in which real vehicles would stand
+//! (coordinated omission); this one does not.
 
-mod client;
+mod bounds;
+mod drive;
 mod report;
+mod target;
 
 use crate::cli::output::say;
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
+use bounds::Bounds;
 use bytes::Bytes;
-use client::{Outcome, Target};
+use drive::{Capacity, measure_capacity, open_loop};
 use placeformer_core::folder::list_images;
-use report::{Bounds, Report, Tally};
+use report::Report;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
-use tokio::sync::{Semaphore, mpsc};
+use std::time::Duration;
+use target::{Target, watch_memory};
+
+/// Time between two samples of the server's memory.
+const MEMORY_INTERVAL: Duration = Duration::from_secs(2);
 
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
@@ -68,10 +74,20 @@ pub struct LoadArgs {
 
 /// Runs it.
 pub fn run(args: LoadArgs) -> anyhow::Result<()> {
+    let is_valid = args.duration.is_finite() && args.duration > 0.0;
+    ensure!(is_valid, "--duration must be a positive number of seconds");
+    let images = read_images(&args.images)?;
+    let target = Target::new(
+        &args.server,
+        &args.map,
+        &args.options,
+        args.api_key.clone(),
+        images,
+    )?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()?;
-    let report = runtime.block_on(drive(&args))?;
+    let report = runtime.block_on(drive(&args, Arc::new(target)))?;
     if let Some(path) = &args.json {
         std::fs::write(path, serde_json::to_vec_pretty(&report)?)
             .with_context(|| format!("cannot write {}", path.display()))?;
@@ -82,46 +98,16 @@ pub fn run(args: LoadArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-async fn drive(args: &LoadArgs) -> anyhow::Result<Report> {
-    ensure!(
-        args.duration.is_finite() && args.duration > 0.0,
-        "--duration must be a positive number of seconds"
-    );
-    let images = read_images(&args.images)?;
-    let target = Arc::new(Target::new(
-        &args.server,
-        &args.map,
-        &args.options,
-        args.api_key.clone(),
-        images,
-    )?);
+async fn drive(args: &LoadArgs, target: Arc<Target>) -> anyhow::Result<Report> {
     target.expect_ready().await?;
     let capacity = match args.times_capacity {
-        Some(_) => {
-            Some(measure_capacity(&target, args.capacity_clients, args.capacity_seconds).await?)
-        }
+        Some(_) => Some(measure_capacity(&target, &args.capacity()).await?),
         None => None,
     };
-    let rate = match (args.rate, args.times_capacity, capacity) {
-        (Some(rate), _, _) => rate,
-        (None, Some(times), Some(capacity)) => times * capacity,
-        _ => bail!("give --rate or --times-capacity"),
-    };
-    ensure!(
-        rate.is_finite() && rate > 0.0,
-        "the rate must be positive, not {rate}"
-    );
-    let memory = tokio::spawn(client::watch_memory(
-        Arc::clone(&target),
-        Duration::from_secs(2),
-    ));
-    let tally = open_loop(
-        &target,
-        rate,
-        Duration::from_secs_f64(args.duration),
-        args.max_in_flight,
-    )
-    .await;
+    let rate = args.rate(capacity)?;
+    let memory = tokio::spawn(watch_memory(Arc::clone(&target), MEMORY_INTERVAL));
+    let duration = Duration::from_secs_f64(args.duration);
+    let tally = open_loop(&target, rate, duration, args.max_in_flight).await;
     memory.abort();
     Ok(Report::new(
         rate,
@@ -132,99 +118,43 @@ async fn drive(args: &LoadArgs) -> anyhow::Result<Report> {
     ))
 }
 
-/// Sends requests when they are due and collects what became of each.
-async fn open_loop(
-    target: &Arc<Target>,
-    rate: f64,
-    duration: Duration,
-    max_in_flight: usize,
-) -> Tally {
-    let in_flight = Arc::new(Semaphore::new(max_in_flight));
-    let (sender, mut outcomes) = mpsc::channel::<(Duration, Outcome)>(2 * max_in_flight.max(1));
-    let collector = tokio::spawn(async move {
-        let mut tally = Tally::default();
-        while let Some((latency, outcome)) = outcomes.recv().await {
-            tally.add(latency, outcome);
+impl LoadArgs {
+    /// How the capacity is measured.
+    fn capacity(&self) -> Capacity {
+        Capacity {
+            clients: self.capacity_clients,
+            seconds: self.capacity_seconds,
         }
-        tally
-    });
-    let start = Instant::now();
-    let total = (rate * duration.as_secs_f64()).ceil() as u64;
-    for number in 0..total {
-        let due = start + Duration::from_secs_f64(number as f64 / rate);
-        tokio::time::sleep_until(due.into()).await;
-        let Ok(permit) = Arc::clone(&in_flight).try_acquire_owned() else {
-            // The receiver lives until the last sender is dropped, so sending cannot fail here or
-            // below.
-            let _ = sender.send((Duration::ZERO, Outcome::NotSent)).await;
-            continue;
-        };
-        let (target, sender) = (Arc::clone(target), sender.clone());
-        tokio::spawn(async move {
-            let outcome = target.query(number as usize).await;
-            let _ = sender.send((due.elapsed(), outcome)).await;
-            drop(permit);
-        });
     }
-    drop(sender);
-    collector.await.unwrap_or_default()
-}
 
-/// Answers per second that a few clients get when each waits for its answer before asking again.
-async fn measure_capacity(
-    target: &Arc<Target>,
-    clients: usize,
-    seconds: f64,
-) -> anyhow::Result<f64> {
-    let start = Instant::now();
-    let end = start + Duration::from_secs_f64(seconds);
-    let workers: Vec<_> = (0..clients.max(1))
-        .map(|worker| {
-            let target = Arc::clone(target);
-            tokio::spawn(async move {
-                let mut answered = 0u64;
-                let mut number = worker;
-                while Instant::now() < end {
-                    match target.query(number).await {
-                        Outcome::Admitted => answered += 1,
-                        Outcome::Rejected { .. } => {
-                            tokio::time::sleep(Duration::from_millis(50)).await
-                        }
-                        Outcome::Failed(reason) => return Err(reason),
-                        Outcome::NotSent => {}
-                    }
-                    number += clients;
-                }
-                Ok(answered)
-            })
-        })
-        .collect();
-    let mut answered = 0;
-    for worker in workers {
-        answered += worker
-            .await?
-            .map_err(|reason| anyhow::anyhow!("while measuring the capacity: {reason}"))?;
+    /// Requests per second: those asked for, or a multiple of the measured capacity.
+    fn rate(&self, capacity: Option<f64>) -> anyhow::Result<f64> {
+        let times = self.times_capacity.zip(capacity);
+        let measured = times.map(|(times, capacity)| times * capacity);
+        let rate = self
+            .rate
+            .or(measured)
+            .context("give --rate or --times-capacity")?;
+        ensure!(
+            rate.is_finite() && rate > 0.0,
+            "the rate must be positive, not {rate}"
+        );
+        Ok(rate)
     }
-    ensure!(
-        answered > 0,
-        "no query was answered in {seconds} s, so there is no capacity to multiply"
-    );
-    Ok(answered as f64 / start.elapsed().as_secs_f64())
 }
 
 /// Reads every image below `folder`, sorted by path so that runs repeat.
 fn read_images(folder: &Path) -> anyhow::Result<Vec<Bytes>> {
-    let images = list_images(folder)?;
+    let mut images = Vec::new();
+    for (_, path) in list_images(folder)? {
+        let image =
+            std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        images.push(image.into());
+    }
     ensure!(
         !images.is_empty(),
         "{} holds no JPEG, PNG or WebP image",
         folder.display()
     );
-    let read = |path: PathBuf| {
-        std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))
-    };
-    images
-        .into_iter()
-        .map(|(_, path)| Ok(read(path)?.into()))
-        .collect()
+    Ok(images)
 }

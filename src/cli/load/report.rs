@@ -1,6 +1,6 @@
 //! The figures of a run.
 
-use super::client::Outcome;
+use super::target::RequestOutcome;
 use hdrhistogram::Histogram;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -35,16 +35,17 @@ fn histogram() -> Histogram<u64> {
 }
 
 impl Tally {
-    pub(super) fn add(&mut self, latency: Duration, outcome: Outcome) {
+    /// Counts one request, with the time from when it was due until it was over.
+    pub(super) fn add(&mut self, latency: Duration, outcome: RequestOutcome) {
         let micros = latency.as_micros() as u64;
         match outcome {
-            Outcome::Admitted => self.admitted.saturating_record(micros),
-            Outcome::Rejected { retry_after } => {
+            RequestOutcome::Admitted => self.admitted.saturating_record(micros),
+            RequestOutcome::Rejected { retry_after } => {
                 self.rejected.saturating_record(micros);
                 self.without_retry_after += u64::from(!retry_after);
             }
-            Outcome::Failed(reason) => *self.failures.entry(reason).or_default() += 1,
-            Outcome::NotSent => self.not_sent += 1,
+            RequestOutcome::Failed(reason) => *self.failures.entry(reason).or_default() += 1,
+            RequestOutcome::NotSent => self.not_sent += 1,
         }
     }
 }
@@ -54,7 +55,7 @@ impl Tally {
 pub(super) struct Latency {
     p50: f64,
     p90: f64,
-    p99: f64,
+    pub(super) p99: f64,
     p999: f64,
     max: f64,
 }
@@ -97,14 +98,16 @@ pub(super) struct Report {
     pub(super) rejected_ms: Latency,
     /// The server's resident memory: at the start, highest, at the end.
     pub(super) resident_bytes: Option<[u64; 3]>,
-    /// Its highest of the second half less its highest of the first: what a leak would grow, and
-    /// warming up would not.
+    /// Its highest of the second half less its highest of the first. A leak makes this grow, and a
+    /// warm-up does not.
     pub(super) resident_growth_bytes: Option<i64>,
     /// What the failures said, with their number.
     pub(super) failures: BTreeMap<String, u64>,
 }
 
 impl Report {
+    /// The figures of a run of `duration` seconds at `rate` requests per second. `memory` are the
+    /// server's resident bytes, in the order sampled.
     pub(super) fn new(
         rate: f64,
         capacity: Option<f64>,
@@ -112,12 +115,6 @@ impl Report {
         tally: Tally,
         memory: Vec<u64>,
     ) -> Self {
-        let resident_bytes = match (memory.first(), memory.iter().max(), memory.last()) {
-            (Some(&first), Some(&peak), Some(&last)) => Some([first, peak, last]),
-            _ => None,
-        };
-        let (first, second) = memory.split_at(memory.len() / 2);
-        let highest = |half: &[u64]| half.iter().max().map(|&bytes| bytes as i64);
         Self {
             rate,
             capacity,
@@ -129,139 +126,99 @@ impl Report {
             not_sent: tally.not_sent,
             admitted_ms: Latency::from(&tally.admitted),
             rejected_ms: Latency::from(&tally.rejected),
-            resident_bytes,
-            resident_growth_bytes: highest(second)
-                .zip(highest(first))
-                .map(|(second, first)| second - first),
+            resident_bytes: resident(&memory),
+            resident_growth_bytes: growth(&memory),
             failures: tally.failures,
         }
     }
 }
 
-/// What a run must keep to. Every rejection must carry Retry-After, and nothing may fail, in any
-/// case.
-#[derive(Debug, Default, clap::Args)]
-pub(super) struct Bounds {
-    /// Fail if the 99th percentile of answered queries is above this.
-    #[arg(long, value_name = "MS")]
-    pub(super) max_p99_ms: Option<f64>,
-    /// Fail if the server's highest resident memory of the second half is more above that of the
-    /// first.
-    #[arg(long, value_name = "MIB")]
-    pub(super) max_growth_mib: Option<f64>,
-    /// Fail if fewer queries than this are answered per second.
-    #[arg(long, value_name = "RATE")]
-    pub(super) min_admitted_rate: Option<f64>,
+/// The first, the highest and the last of the samples.
+fn resident(memory: &[u64]) -> Option<[u64; 3]> {
+    let first = *memory.first()?;
+    let highest = *memory.iter().max()?;
+    let last = *memory.last()?;
+    Some([first, highest, last])
 }
 
-impl Bounds {
-    /// What the run broke, in words; nothing if it kept to everything.
-    pub(super) fn broken_by(&self, report: &Report) -> Vec<String> {
-        let mut broken = Vec::new();
-        if report.rejected_without_retry_after > 0 {
-            broken.push(format!(
-                "{} rejections carried no Retry-After",
-                report.rejected_without_retry_after
-            ));
-        }
-        if report.failed > 0 {
-            broken.push(format!(
-                "{} requests failed with neither an answer nor a rejection",
-                report.failed
-            ));
-        }
-        if let Some(bound) = self.max_p99_ms
-            && report.admitted_ms.p99 > bound
-        {
-            broken.push(format!(
-                "the 99th percentile is {:.0} ms, above {bound} ms",
-                report.admitted_ms.p99
-            ));
-        }
-        let rate = report.admitted as f64 / report.duration;
-        if let Some(bound) = self.min_admitted_rate
-            && rate < bound
-        {
-            broken.push(format!(
-                "{rate:.2} queries were answered per second, fewer than {bound}"
-            ));
-        }
-        match (
-            self.max_growth_mib,
-            report.resident_growth_bytes.map(mebibytes),
-        ) {
-            (Some(bound), Some(growth)) if growth > bound => {
-                broken.push(format!(
-                    "the server's memory grew by {growth:.0} MiB, more than {bound} MiB"
-                ));
-            }
-            (Some(_), None) => broken
-                .push("the server's memory could not be read, so its growth is not known".into()),
-            _ => {}
-        }
-        broken
-    }
+/// The highest sample of the second half less the highest of the first.
+fn growth(memory: &[u64]) -> Option<i64> {
+    let (first, second) = memory.split_at(memory.len() / 2);
+    let first = *first.iter().max()?;
+    let second = *second.iter().max()?;
+    Some(second as i64 - first as i64)
 }
 
-fn mebibytes(bytes: i64) -> f64 {
+/// Bytes as mebibytes.
+pub(super) fn mebibytes(bytes: i64) -> f64 {
     bytes as f64 / f64::from(1 << 20)
 }
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if let Some(capacity) = self.capacity {
-            writeln!(f, "capacity   {capacity:.2} queries/s (closed loop)")?;
-        }
-        writeln!(
-            f,
-            "offered    {:.2} queries/s for {:.0} s",
-            self.rate, self.duration
-        )?;
-        writeln!(
-            f,
-            "admitted   {} ({:.2}/s)",
-            self.admitted,
-            self.admitted as f64 / self.duration
-        )?;
-        writeln!(
-            f,
-            "rejected   {} ({} without Retry-After)",
-            self.rejected, self.rejected_without_retry_after
-        )?;
-        writeln!(f, "failed     {}", self.failed)?;
-        writeln!(f, "not sent   {}", self.not_sent)?;
-        for (name, latency) in [
-            ("admitted", &self.admitted_ms),
-            ("rejected", &self.rejected_ms),
-        ] {
-            writeln!(
-                f,
-                "{name}   ms: p50 {:.1}  p90 {:.1}  p99 {:.1}  p99.9 {:.1}  max {:.1}",
-                latency.p50, latency.p90, latency.p99, latency.p999, latency.max
-            )?;
-        }
-        if let Some([first, peak, last]) = self.resident_bytes {
-            let mib = |bytes: u64| mebibytes(bytes as i64);
-            writeln!(
-                f,
-                "resident   {:.0} MiB at the start, {:.0} highest, {:.0} at the end",
-                mib(first),
-                mib(peak),
-                mib(last)
-            )?;
-        }
-        if let Some(growth) = self.resident_growth_bytes {
-            writeln!(
-                f,
-                "growth     {:+.1} MiB from the first half to the second",
-                mebibytes(growth)
-            )?;
-        }
+        self.write_counts(f)?;
+        write_latency(f, "admitted", &self.admitted_ms)?;
+        write_latency(f, "rejected", &self.rejected_ms)?;
+        self.write_memory(f)?;
         for (reason, count) in &self.failures {
             writeln!(f, "  {count} x {reason}")?;
         }
         Ok(())
     }
+}
+
+impl Report {
+    fn write_counts(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            rate,
+            duration,
+            admitted,
+            rejected,
+            ..
+        } = self;
+        if let Some(capacity) = self.capacity {
+            writeln!(f, "capacity   {capacity:.2} queries/s (closed loop)")?;
+        }
+        writeln!(f, "offered    {rate:.2} queries/s for {duration:.0} s")?;
+        let admitted_rate = *admitted as f64 / duration;
+        writeln!(f, "admitted   {admitted} ({admitted_rate:.2}/s)")?;
+        let without = self.rejected_without_retry_after;
+        writeln!(f, "rejected   {rejected} ({without} without Retry-After)")?;
+        writeln!(f, "failed     {}", self.failed)?;
+        writeln!(f, "not sent   {}", self.not_sent)
+    }
+
+    fn write_memory(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(resident) = self.resident_bytes {
+            let [first, highest, last] = resident.map(|bytes| mebibytes(bytes as i64));
+            writeln!(
+                f,
+                "resident   {first:.0} MiB at the start, {highest:.0} highest, {last:.0} at the end"
+            )?;
+        }
+        if let Some(growth) = self.resident_growth_bytes {
+            let growth = mebibytes(growth);
+            writeln!(
+                f,
+                "growth     {growth:+.1} MiB from the first half to the second"
+            )?;
+        }
+        Ok(())
+    }
+}
+
+fn write_latency(f: &mut fmt::Formatter<'_>, name: &str, latency: &Latency) -> fmt::Result {
+    let Latency {
+        p50,
+        p90,
+        p99,
+        p999,
+        max,
+    } = latency;
+    writeln!(
+        f,
+        "{name}   ms: p50 {p50:.1}  p90 {p90:.1}  p99 {p99:.1}  p99.9 {p999:.1}  max {max:.1}"
+    )
 }
 
 #[cfg(test)]
@@ -271,70 +228,24 @@ mod tests {
     #[test]
     fn a_report_counts_each_outcome_once() {
         let mut tally = Tally::default();
-        tally.add(Duration::from_millis(10), Outcome::Admitted);
-        tally.add(Duration::from_millis(30), Outcome::Admitted);
+        tally.add(Duration::from_millis(10), RequestOutcome::Admitted);
+        tally.add(Duration::from_millis(30), RequestOutcome::Admitted);
         tally.add(
             Duration::from_millis(1),
-            Outcome::Rejected { retry_after: true },
+            RequestOutcome::Rejected { retry_after: true },
         );
         tally.add(
             Duration::from_millis(1),
-            Outcome::Rejected { retry_after: false },
+            RequestOutcome::Rejected { retry_after: false },
         );
-        tally.add(Duration::ZERO, Outcome::Failed("500".into()));
-        tally.add(Duration::ZERO, Outcome::NotSent);
+        tally.add(Duration::ZERO, RequestOutcome::Failed("500".into()));
+        tally.add(Duration::ZERO, RequestOutcome::NotSent);
         let report = Report::new(2.0, None, 3.0, tally, vec![5, 9, 7]);
-        assert_eq!(
-            (
-                report.admitted,
-                report.rejected,
-                report.failed,
-                report.not_sent
-            ),
-            (2, 2, 1, 1)
-        );
-        assert_eq!(
-            (report.rejected_without_retry_after, report.resident_bytes),
-            (1, Some([5, 9, 7]))
-        );
+        assert_eq!((report.admitted, report.rejected), (2, 2));
+        assert_eq!((report.failed, report.not_sent), (1, 1));
+        assert_eq!(report.rejected_without_retry_after, 1);
+        assert_eq!(report.resident_bytes, Some([5, 9, 7]));
         assert!((report.admitted_ms.max - 30.0).abs() < 0.1);
         assert_eq!(report.resident_growth_bytes, Some(4));
-    }
-
-    #[test]
-    fn a_broken_bound_is_told_and_a_kept_one_is_not() {
-        let report = |memory| {
-            let mut tally = Tally::default();
-            tally.add(Duration::from_millis(100), Outcome::Admitted);
-            Report::new(1.0, None, 1.0, tally, memory)
-        };
-        let mebi = |count: u64| count << 20;
-        let kept = Bounds {
-            max_p99_ms: Some(110.0),
-            max_growth_mib: Some(8.0),
-            min_admitted_rate: Some(0.9),
-        };
-        assert_eq!(
-            kept.broken_by(&report(vec![mebi(10), mebi(50), mebi(40), mebi(58)])),
-            Vec::<String>::new()
-        );
-        let broken = Bounds {
-            max_p99_ms: Some(90.0),
-            max_growth_mib: Some(7.0),
-            min_admitted_rate: Some(1.1),
-        };
-        assert_eq!(
-            broken
-                .broken_by(&report(vec![mebi(10), mebi(50), mebi(40), mebi(58)]))
-                .len(),
-            3
-        );
-        let unknown = broken.broken_by(&report(Vec::new()));
-        assert!(
-            unknown
-                .iter()
-                .any(|reason| reason.contains("could not be read")),
-            "{unknown:?}"
-        );
     }
 }

@@ -3,6 +3,7 @@
 use super::head::{Source, fit};
 use super::{RunArgs, bar, facts, finish, notes, show};
 use crate::cli::output::say;
+use crate::cli::progress::ProgressBars;
 use anyhow::ensure;
 use placeformer_lab::train::{
     Augmentation, BackboneModel, Progress, Session, TrainError, TrainableBlocks, TripletSet,
@@ -30,7 +31,11 @@ pub(super) fn train(
         "blocks are trained under the mean of the tokens, and this head takes {}",
         start.aggregate()
     );
-    let weights = VitWeights::load(&resolve_weights(&extract)?, extract.preset, extract.heads)?;
+    let weights = VitWeights::load(
+        &resolve_weights(&extract, &ProgressBars::default())?,
+        extract.preset,
+        extract.heads,
+    )?;
     let (spec, images) = (extract.encoder_spec()?, ImageConfig::default());
     let model = BackboneModel::new(weights, spec, start.weights(), blocks, images, augmentation)?;
     let identity = format!(
@@ -90,7 +95,7 @@ fn starting_head(
     extract: &ExtractConfig,
     training: &TripletSet,
 ) -> anyhow::Result<Head> {
-    let extractor = open_extractor(extract)?;
+    let extractor = open_extractor(extract, &ProgressBars::default())?;
     match extractor.head() {
         Some(head) => Ok(head.clone()),
         None => {

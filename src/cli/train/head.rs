@@ -1,6 +1,7 @@
 //! Training the head alone, on pooled tokens.
 
 use super::{HeadTrainArgs, RunArgs, bar, facts, finish, notes, show};
+use crate::cli::progress::ProgressBars;
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use placeformer_lab::train::{
@@ -23,7 +24,7 @@ pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
     let sides = args.data.load(args.method.seed)?;
     eprintln!("{}", sides.description);
     let extract = args.model.extract_config()?;
-    let extractor = open_extractor(&extract)?;
+    let extractor = open_extractor(&extract, &ProgressBars::default())?;
     let mut source = Source::open(args, &extractor)?;
     let training = source.tokens(&sides.training)?;
     let validation = source.tokens(&sides.validation)?;

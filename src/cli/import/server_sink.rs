@@ -1,0 +1,288 @@
+//! An import through a running server: raw image bodies, sent again while the server is busy, and
+//! never again where the request itself is wrong.
+
+use super::sink::{Outcome, Sent, Sink, Upload};
+use crate::cli::client::{BYTES, ClientError, Connection, ServerArgs, ServerClient};
+use anyhow::Context;
+use placeformer_core::error::ErrorCode;
+use placeformer_core::types::MapName;
+use reqwest::header::CONTENT_TYPE;
+use reqwest::{Method, RequestBuilder, StatusCode};
+use serde::Deserialize;
+use std::collections::HashMap;
+use time::format_description::well_known::Rfc3339;
+
+/// References listed by one request.
+const PAGE: &str = "1000";
+
+/// A server as a sink.
+pub(super) struct ServerSink {
+    client: ServerClient,
+}
+
+/// One page of a map's references; of each reference what an import compares.
+#[derive(Deserialize)]
+struct ReferencePage {
+    references: Vec<ListedReference>,
+    /// Where the next page begins, if there is one.
+    next: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct ListedReference {
+    external_id: Option<String>,
+    content_sha256: Option<String>,
+}
+
+impl ServerSink {
+    /// Prepares to send every photo up to `attempts` times.
+    pub(super) fn new(server: ServerArgs, attempts: u32) -> anyhow::Result<Self> {
+        let client = ServerClient::with_attempts(server, attempts)?;
+        Ok(Self { client })
+    }
+
+    /// The page that begins at `cursor`; `None` if there is no such map.
+    fn page(&self, map: &MapName, cursor: Option<&str>) -> anyhow::Result<Option<ReferencePage>> {
+        let request = |connection: &Connection| {
+            connection
+                .request(Method::GET, "/references")
+                .query(&[("map", map.as_str()), ("limit", PAGE)])
+                .query(&cursor.map(|cursor| [("cursor", cursor)]))
+        };
+        match self.client.attempt(request).answer {
+            Ok(answer) => {
+                let page = serde_json::from_value(answer.json())
+                    .context("the server's answer is not a page of references")?;
+                Ok(Some(page))
+            }
+            Err(error) if error.code() == ErrorCode::MapNotFound.as_str() => Ok(None),
+            Err(error) => Err(error.into()),
+        }
+    }
+}
+
+impl Sink for ServerSink {
+    fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, String>> {
+        let mut present = HashMap::new();
+        let mut cursor: Option<String> = None;
+        while let Some(page) = self.page(map, cursor.as_deref())? {
+            for reference in page.references {
+                if let (Some(id), Some(hash)) = (reference.external_id, reference.content_sha256) {
+                    present.insert(id, hash);
+                }
+            }
+            cursor = page.next;
+            if cursor.is_none() {
+                break;
+            }
+        }
+        Ok(present)
+    }
+
+    fn send(&self, upload: Upload) -> Sent {
+        let parameters = parameters(&upload);
+        let request = |connection: &Connection| -> RequestBuilder {
+            connection
+                .request(Method::POST, "/references")
+                .query(&parameters)
+                .header(CONTENT_TYPE, BYTES)
+                // The clone shares the bytes.
+                .body(upload.image.clone())
+        };
+        let attempted = self.client.attempt(request);
+        let outcome = match attempted.answer {
+            Ok(answer) => stored(answer.status(), answer.json()["id"].as_str()),
+            Err(error) => refused(&error),
+        };
+        Sent {
+            outcome,
+            attempts: attempted.attempts,
+        }
+    }
+}
+
+fn stored(status: StatusCode, id: Option<&str>) -> Outcome {
+    match id {
+        Some(id) if status == StatusCode::CREATED => Outcome::Created(id.to_owned()),
+        Some(id) => Outcome::Present(id.to_owned()),
+        None => Outcome::Refused {
+            code: "unexpected_answer".into(),
+            detail: format!("the server answered {status} without a reference id"),
+        },
+    }
+}
+
+fn refused(error: &ClientError) -> Outcome {
+    Outcome::Refused {
+        code: error.code().to_owned(),
+        detail: error.detail(),
+    }
+}
+
+/// The fields of a photo as query parameters.
+fn parameters(upload: &Upload) -> Vec<(&'static str, String)> {
+    let fields = &upload.fields;
+    let mut parameters = vec![("map", upload.map.to_string())];
+    if let Some(id) = &fields.external_id {
+        parameters.push(("external_id", id.to_string()));
+    }
+    if let Some(location) = fields.location {
+        parameters.push(("lat", location.lat().to_string()));
+        parameters.push(("lon", location.lon().to_string()));
+    }
+    if let Some(heading) = fields.heading {
+        parameters.push(("heading", heading.degrees().to_string()));
+    }
+    let captured_at = fields.captured_at.map(|time| time.format(&Rfc3339));
+    if let Some(Ok(time)) = captured_at {
+        parameters.push(("captured_at", time));
+    }
+    parameters
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use placeformer_core::types::{GeoPoint, ReferenceFields};
+    use std::io::{BufRead, BufReader, Read, Write};
+    use std::net::{TcpListener, TcpStream};
+    use std::sync::mpsc;
+
+    /// Answers one connection after the other with the given responses and passes on the request
+    /// lines.
+    fn server(answers: Vec<&'static str>) -> (String, mpsc::Receiver<String>) {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let url = format!("http://{}/", listener.local_addr().unwrap());
+        let (sender, receiver) = mpsc::sync_channel(64);
+        std::thread::spawn(move || {
+            for answer in answers {
+                let (mut stream, _) = listener.accept().unwrap();
+                let _ = sender.send(read_request(&stream));
+                let (head, body) = answer.split_once('|').unwrap();
+                let length = body.len();
+                write!(
+                    stream,
+                    "HTTP/1.1 {head}\r\ncontent-length: {length}\r\nconnection: close\r\n\r\n{body}"
+                )
+                .unwrap();
+            }
+        });
+        (url, receiver)
+    }
+
+    /// Reads one request to its end and returns its first line.
+    fn read_request(stream: &TcpStream) -> String {
+        let mut reader = BufReader::new(stream.try_clone().unwrap());
+        let mut request = String::new();
+        reader.read_line(&mut request).unwrap();
+        let mut length = 0;
+        let mut line = String::new();
+        loop {
+            line.clear();
+            reader.read_line(&mut line).unwrap();
+            let lower = line.to_ascii_lowercase();
+            if let Some(value) = lower.strip_prefix("content-length:") {
+                length = value.trim().parse().unwrap();
+            }
+            if line.trim().is_empty() {
+                break;
+            }
+        }
+        let mut body = Vec::new();
+        reader.take(length).read_to_end(&mut body).unwrap();
+        request.trim().to_owned()
+    }
+
+    fn sink(server: String, attempts: u32) -> ServerSink {
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let args = ServerArgs {
+            server,
+            api_key: None,
+            timeout: 10,
+        };
+        ServerSink::new(args, attempts).unwrap()
+    }
+
+    fn upload() -> Upload {
+        let fields = ReferenceFields {
+            external_id: Some("a b&c.jpg".parse().unwrap()),
+            location: Some(GeoPoint::new(1.5, -2.25).unwrap()),
+            ..Default::default()
+        };
+        Upload {
+            map: "m".parse().unwrap(),
+            fields,
+            image: bytes::Bytes::from_static(b"image"),
+        }
+    }
+
+    #[test]
+    fn a_busy_server_is_asked_again_and_fields_are_sent() {
+        let (url, requests) = server(vec![
+            "503 Busy\r\nretry-after: 0|{\"code\":\"overloaded\",\"retryable\":true}",
+            "429 Slow\r\nretry-after: 0|{\"code\":\"rate_limited\",\"retryable\":true}",
+            "201 Created|{\"id\":\"r1\"}",
+        ]);
+        let sent = sink(url, 5).send(upload());
+        assert_eq!(
+            sent,
+            Sent {
+                outcome: Outcome::Created("r1".into()),
+                attempts: 3
+            }
+        );
+        let request = requests.recv().unwrap();
+        assert!(
+            request
+                .starts_with("POST /references?map=m&external_id=a+b%26c.jpg&lat=1.5&lon=-2.25 "),
+            "{request}"
+        );
+    }
+
+    #[test]
+    fn a_wrong_image_is_not_sent_twice_and_patience_ends() {
+        let (url, _) = server(vec![
+            "422 No|{\"code\":\"image_undecodable\",\"detail\":\"truncated\",\"retryable\":false}",
+        ]);
+        let sent = sink(url, 5).send(upload());
+        let refused = |code: &str, detail: &str| Outcome::Refused {
+            code: code.into(),
+            detail: detail.into(),
+        };
+        assert_eq!(
+            sent,
+            Sent {
+                outcome: refused("image_undecodable", "truncated"),
+                attempts: 1
+            }
+        );
+        let (url, _) = server(vec!["502 Bad|<html>", "502 Bad|<html>"]);
+        let sent = sink(url, 2).send(upload());
+        assert_eq!(
+            sent,
+            Sent {
+                outcome: refused("http_502", "the server answered 502 Bad Gateway"),
+                attempts: 2
+            }
+        );
+    }
+
+    #[test]
+    fn pages_are_followed_to_the_end_and_an_unknown_map_is_empty() {
+        let (url, requests) = server(vec![
+            "200 OK|{\"references\":[{\"external_id\":\"a\",\"content_sha256\":\"1\"},\
+             {\"external_id\":null}],\"next\":\"n1\"}",
+            "200 OK|{\"references\":[{\"external_id\":\"b\",\"content_sha256\":\"2\"}],\
+             \"next\":null}",
+            "404 No|{\"code\":\"map_not_found\",\"retryable\":false}",
+        ]);
+        let sink = sink(url, 2);
+        let present = sink.present(&"m".parse().unwrap()).unwrap();
+        assert_eq!(
+            (present.len(), present["a"].as_str(), present["b"].as_str()),
+            (2, "1", "2")
+        );
+        assert!(requests.iter().nth(1).unwrap().contains("cursor=n1"));
+        assert!(sink.present(&"m".parse().unwrap()).unwrap().is_empty());
+    }
+}
