@@ -10,7 +10,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 if [ -z "${BIN:-}" ]; then
-  cargo build --quiet
+  cargo build --quiet --locked
   BIN="${CARGO_TARGET_DIR:-target}/debug/placeformer"
 fi
 VENV="${VENV:-.venv}"

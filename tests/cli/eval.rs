@@ -1,34 +1,15 @@
 //! What `eval`, `import` and `match` say to wrong arguments, before any model is loaded; and `eval`
 //! from photos to figures, files and pages, on a small drawn town.
 
-#[path = "common/town.rs"]
-mod town;
-
+use crate::common::program::{self, SIZE, has_model, offline, prints, refused_by, succeeds, town};
 use placeformer_core::types::Calibration;
 use serde_json::Value;
 use std::path::Path;
-use std::process::{Command, Output};
-use town::{SIZE, has_model, prints, succeeds, town};
 
-fn placeformer(arguments: &[&str], folder: &Path) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    // An empty cache and no network address: whatever gets as far as the model fails for that
-    // reason instead.
-    command
-        .args(arguments)
-        .env("PLACEFORMER_CACHE", folder.join("cache"))
-        .env("HF_ENDPOINT", "http://127.0.0.1:9");
-    command
-        .env_remove("PLACEFORMER_WEIGHTS")
-        .env_remove("PLACEFORMER_CONFIG")
-        .env("PATH", "");
-    command.output().expect("the binary was built")
-}
-
+/// What the program says to arguments that it refuses before it needs a model.
+#[track_caller]
 fn refusal(arguments: &[&str], folder: &Path) -> String {
-    let output = placeformer(arguments, folder);
-    assert!(!output.status.success(), "{arguments:?} succeeded");
-    String::from_utf8_lossy(&output.stderr).into_owned()
+    refused_by(&mut offline(folder, arguments))
 }
 
 #[test]
@@ -170,7 +151,9 @@ fn eval_calibrate_takes_the_same_data_and_its_own_options() {
 #[test]
 fn eval_calibrate_says_where_unknown_places_come_from() {
     let folder = tempfile::tempdir().unwrap();
-    let output = placeformer(&["eval", "calibrate", "--help"], folder.path());
+    let output = offline(folder.path(), &["eval", "calibrate", "--help"])
+        .output()
+        .unwrap();
     let help = String::from_utf8_lossy(&output.stdout);
     let flowing = help.split_whitespace().collect::<Vec<_>>().join(" ");
     assert!(
@@ -472,7 +455,7 @@ fn a_calibration_is_fitted_and_judged_elsewhere() {
     let page = std::fs::read_to_string(folder.join("out.html")).unwrap();
     assert!(page.contains("the one given, error"));
     // It holds for this re-ranking only.
-    let error = town::refusal(
+    let error = program::refusal(
         folder,
         &eval(&["--calibration", "own.json", "--scales", "1"]),
     );

@@ -1,13 +1,9 @@
 //! `train`, `head train`, `head fit` and `map rehead` from flags to files, on a small drawn town.
 
-#[path = "common/town.rs"]
-mod town;
-
+use crate::common::program::{SIZE, command, has_model, refusal, succeeds, town};
 use placeformer_store::{PlaceStore, SqliteStore, StoreConfig};
 use placeformer_vision::extract::{Aggregate, Head, Preset, VitWeights};
 use std::path::Path;
-use std::process::Command;
-use town::{SERVED_SIZE, SIZE, has_model, refusal, succeeds, town};
 
 fn train(more: &[&'static str]) -> Vec<&'static str> {
     let data = ["--dataset", "csv", "--root", "town", "--input-size", SIZE];
@@ -128,28 +124,19 @@ fn give_to_a_map(folder: &Path) {
     assert_eq!(after, new.rebind(&before).unwrap());
     assert!(succeeds(folder, &rehead("new.safetensors")).contains("already"));
     // What extraction with the new head gives, but for the half precision of what the store kept.
-    let mut fresh = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    fresh
-        .args([
-            "import",
-            "town/database",
-            "--map",
-            "fresh",
-            "--data",
-            "store",
-        ])
-        .current_dir(folder);
-    fresh
-        .env("PLACEFORMER_EXTRACT__INPUT_SIZE", SERVED_SIZE)
-        .env("PLACEFORMER_EXTRACT__HEAD", "new.safetensors");
-    assert!(
-        fresh
-            .env_remove("PLACEFORMER_CONFIG")
-            .output()
-            .unwrap()
-            .status
-            .success()
-    );
+    let arguments = [
+        "import",
+        "town/database",
+        "--map",
+        "fresh",
+        "--data",
+        "store",
+    ];
+    let fresh = command(folder, &arguments)
+        .env("PLACEFORMER_EXTRACT__HEAD", "new.safetensors")
+        .output()
+        .unwrap();
+    assert!(fresh.status.success());
     let (model_of_fresh, expected) = model("fresh");
     assert_eq!(model_of_fresh, after);
     // Four photos are imported at once, so the two maps differ in order.

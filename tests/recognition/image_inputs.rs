@@ -1,5 +1,6 @@
-//! Every awkward image a client may send, through the public door of the image room.
+//! Every awkward image that a client may send, through the public functions of the image module.
 
+use crate::common::noise;
 use exif::{Field, In, Rational, Tag, Value, experimental::Writer};
 use image::{DynamicImage, ImageFormat};
 use placeformer_core::types::ImageSize;
@@ -455,12 +456,9 @@ fn limits_are_checked_before_decoding() {
 fn a_file_cut_anywhere_is_refused_and_says_so() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/images");
     let progressive = std::fs::read(folder.join("progressive.jpg")).unwrap();
-    let noise: Vec<u8> = (0..48 * 32 * 3u32)
-        .map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8)
-        .collect();
     let noise = RgbImage {
         size: SIZE,
-        pixels: noise,
+        pixels: noise::bytes(1, 48 * 32 * 3),
     };
     for (name, bytes) in [
         ("jpeg", encode_jpeg(&noise, 90).unwrap()),
@@ -643,8 +641,8 @@ proptest! {
                 jpeg_with_exif(&encode_jpeg(&picture(), 90).unwrap(), &turned)
             }
             1 => encode_png(&picture()).unwrap(),
-            2 => include_bytes!("fixtures/images/progressive.jpg").to_vec(),
-            _ => include_bytes!("fixtures/images/lossy.webp").to_vec(),
+            2 => include_bytes!("../fixtures/images/progressive.jpg").to_vec(),
+            _ => include_bytes!("../fixtures/images/lossy.webp").to_vec(),
         };
         for (at, value) in &damage {
             let at = at.index(bytes.len());

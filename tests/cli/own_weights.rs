@@ -1,61 +1,19 @@
 //! A server of one's own weights and head, as `train` writes them, and where its settings come
 //! from: the real binary.
 
+use crate::common::noise;
+use crate::common::program::{Server, offline, refused_by};
+use crate::common::weights::made_up;
 use placeformer_core::types::{GLOBAL_DIM, ImageSize};
 use placeformer_models::open_extractor;
-use placeformer_vision::extract::{
-    Aggregate, BlockWeights, ExtractConfig, Head, HeadChoice, Linear, Norm, Preset, VitWeights,
-};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-use std::io::{BufRead, BufReader};
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
-use std::time::{Duration, Instant};
+use placeformer_vision::extract::{Aggregate, ExtractConfig, Head, HeadChoice, Preset, VitWeights};
+use std::path::PathBuf;
+use std::process::Command;
 
 /// The paper's geometry, of which no weights are published, with made-up values.
 fn weights() -> VitWeights {
     let preset = Preset::PlaceformerVits16;
-    let (geometry, mut random) = (preset.geometry(), ChaCha8Rng::seed_from_u64(7));
-    let (dim, mlp, patch) = (geometry.dim, geometry.mlp_dim, geometry.patch);
-    let mut values = |count: usize| {
-        (0..count)
-            .map(|_| random.random_range(-0.05..0.05))
-            .collect::<Vec<f32>>()
-    };
-    let norm = || Norm {
-        weight: vec![1.0; dim],
-        bias: vec![0.0; dim],
-    };
-    let mut linear = |from: usize, to: usize| Linear {
-        weight: values(from * to),
-        bias: vec![0.0; to],
-    };
-    let patch_embed = linear(3 * patch * patch, dim);
-    let blocks = (0..geometry.depth)
-        .map(|_| BlockWeights {
-            norm1: norm(),
-            qkv: linear(dim, 3 * dim),
-            proj: linear(dim, dim),
-            layer_scale1: None,
-            norm2: norm(),
-            fc1: linear(dim, mlp),
-            fc2: linear(mlp, dim),
-            layer_scale2: None,
-        })
-        .collect();
-    let position_grid = (14, 14);
-    VitWeights {
-        preset,
-        geometry,
-        position_grid,
-        patch_embed,
-        cls_token: values(dim),
-        positions: values((1 + position_grid.0 * position_grid.1) * dim),
-        blocks,
-        norm: norm(),
-        unused_parameters: 0,
-    }
+    made_up(preset, preset.geometry(), (14, 14), 7)
 }
 
 /// A folder with weights, a head that fits them, and a configuration that names only the geometry.
@@ -113,108 +71,14 @@ impl Own {
     }
 
     fn command(&self, arguments: &[&str]) -> Command {
-        let mut command = command(self.folder.path(), arguments);
+        let mut command = offline(self.folder.path(), arguments);
         command.arg("--config").arg(self.path("placeformer.toml"));
         command
     }
 }
 
-/// The binary where nothing can be fetched and nothing is set but what a test sets.
-fn command(folder: &Path, arguments: &[&str]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    for (name, _) in
-        std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("PLACEFORMER_"))
-    {
-        command.env_remove(name);
-    }
-    command
-        .args(arguments)
-        .env("PLACEFORMER_CACHE", folder.join("cache"))
-        .env("HF_ENDPOINT", "http://127.0.0.1:9");
-    command.current_dir(folder);
-    command
-}
-
-/// A running server; killed when dropped.
-struct Server {
-    child: Child,
-    url: String,
-    http: reqwest::blocking::Client,
-}
-
-impl Server {
-    fn start(mut command: Command) -> Self {
-        let mut child = command
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
-        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        let url =
-            lines.find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
-        // Fails only if one is installed already, which is as good.
-        let _ = rustls::crypto::ring::default_provider().install_default();
-        let http = reqwest::blocking::Client::builder()
-            .timeout(Duration::from_secs(60))
-            .build()
-            .unwrap();
-        let server = Self {
-            child,
-            url: url.expect("the server did not start"),
-            http,
-        };
-        let began = Instant::now();
-        while server
-            .http
-            .get(format!("{}/readyz", server.url))
-            .send()
-            .is_ok_and(|answer| answer.status() != 200)
-        {
-            assert!(
-                began.elapsed() < Duration::from_secs(120),
-                "the server never became ready"
-            );
-            std::thread::sleep(Duration::from_millis(20));
-        }
-        server
-    }
-
-    fn get(&self, path: &str) -> serde_json::Value {
-        self.http
-            .get(format!("{}{path}", self.url))
-            .send()
-            .unwrap()
-            .json()
-            .unwrap()
-    }
-
-    fn post(&self, path: &str, body: Vec<u8>) -> (u16, serde_json::Value) {
-        let request = self
-            .http
-            .post(format!("{}{path}", self.url))
-            .header("content-type", "image/png")
-            .body(body);
-        let answer = request.send().unwrap();
-        (answer.status().as_u16(), answer.json().unwrap())
-    }
-}
-
-impl Drop for Server {
-    fn drop(&mut self) {
-        // It may have died by itself, which the test has then told.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
 fn picture(seed: u64) -> Vec<u8> {
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let pixels = image::RgbImage::from_fn(64, 48, |_, _| image::Rgb(random.random()));
-    let mut bytes = std::io::Cursor::new(Vec::new());
-    pixels
-        .write_to(&mut bytes, image::ImageFormat::Png)
-        .unwrap();
-    bytes.into_inner()
+    noise::png(seed, 64, 48)
 }
 
 #[test]
@@ -282,11 +146,6 @@ fn the_variable_that_other_commands_read_counts_for_the_server_too() {
     );
 }
 
-fn refusal(output: &Output) -> String {
-    assert!(!output.status.success());
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
-
 #[test]
 fn a_server_that_could_not_search_does_not_start_and_says_what_to_set() {
     let own = Own::new();
@@ -306,7 +165,7 @@ fn a_server_that_could_not_search_does_not_start_and_says_what_to_set() {
             &["missing.safetensors"],
         ),
     ] {
-        let error = refusal(&own.command(&[&serve, flags].concat()).output().unwrap());
+        let error = refused_by(&mut own.command(&[&serve, flags].concat()));
         assert!(
             parts.iter().all(|part| error.contains(part)),
             "{flags:?}: {error}"
@@ -317,12 +176,8 @@ fn a_server_that_could_not_search_does_not_start_and_says_what_to_set() {
 #[test]
 fn nothing_is_fetched_where_that_is_forbidden() {
     let folder = tempfile::tempdir().unwrap();
-    let error = refusal(
-        &command(folder.path(), &["model", "pull"])
-            .env("PLACEFORMER_OFFLINE", "1")
-            .output()
-            .unwrap(),
-    );
+    let mut pulling = offline(folder.path(), &["model", "pull"]);
+    let error = refused_by(pulling.env("PLACEFORMER_OFFLINE", "1"));
     assert!(
         error.contains("PLACEFORMER_OFFLINE") && !error.contains("Tried"),
         "{error}"
@@ -342,7 +197,7 @@ fn flags_win_over_variables_and_variables_over_the_file() {
         "--log",
         "error",
     ];
-    let mut printing = command(folder.path(), &arguments);
+    let mut printing = offline(folder.path(), &arguments);
     printing
         .env("PLACEFORMER_HTTP__MAX_CONNECTIONS", "13")
         .env("PLACEFORMER_LOG__FILTER", "debug");
@@ -363,19 +218,14 @@ fn flags_win_over_variables_and_variables_over_the_file() {
         "{printed}"
     );
     std::fs::write(folder.path().join("printed.toml"), &printed).unwrap();
-    let again = command(
+    let again = offline(
         folder.path(),
         &["serve", "--print-config", "--config", "printed.toml"],
     )
     .output()
     .unwrap();
     assert_eq!(String::from_utf8(again.stdout).unwrap(), printed);
-    let mut misspelt = command(folder.path(), &["serve", "--print-config"]);
-    let error = refusal(
-        &misspelt
-            .env("PLACEFORMER_HTTP_MAX_PAGE", "1")
-            .output()
-            .unwrap(),
-    );
+    let mut misspelt = offline(folder.path(), &["serve", "--print-config"]);
+    let error = refused_by(misspelt.env("PLACEFORMER_HTTP_MAX_PAGE", "1"));
     assert!(error.contains("PLACEFORMER_HTTP__MAX_PAGE"), "{error}");
 }

@@ -5,6 +5,7 @@
 //! between near-equal attentions. From the picture file, pixels within 0.02 and the global
 //! descriptor's cosine at least 0.9999.
 
+use crate::common::program::has_model;
 use placeformer_core::types::{ImageSize, ImageTensor};
 use placeformer_models::model_path;
 use placeformer_vision::extract::{
@@ -26,22 +27,10 @@ const SIZES: [(u32, u32); 3] = [(224, 224), (448, 336), (644, 476)];
 fn weights() -> Option<&'static VitWeights> {
     static WEIGHTS: OnceLock<Option<VitWeights>> = OnceLock::new();
     let load = || {
-        let path = model_path(Preset::Dinov2Vits14).unwrap();
-        if !path.exists()
-            && std::env::var("PLACEFORMER_TEST_NO_MODEL").is_ok_and(|value| value == "1")
-        {
-            println!(
-                "skipped: no model at {} and PLACEFORMER_TEST_NO_MODEL=1",
-                path.display()
-            );
-            return None;
-        }
-        assert!(
-            path.exists(),
-            "no model at {}: run `placeformer model pull dinov2-vits14` first",
-            path.display()
-        );
-        Some(VitWeights::load(&path, Preset::Dinov2Vits14, None).unwrap())
+        has_model().then(|| {
+            let path = model_path(Preset::Dinov2Vits14).unwrap();
+            VitWeights::load(&path, Preset::Dinov2Vits14, None).unwrap()
+        })
     };
     WEIGHTS.get_or_init(load).as_ref()
 }

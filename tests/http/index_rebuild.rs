@@ -1,10 +1,8 @@
 //! The index is a cache of the store: after any history, a service rebuilt from the store answers
 //! as the live one does, and both as a plain model of what was asked of them says.
 
-#[path = "common/places.rs"]
-mod places;
-mod support;
-
+use crate::common::places::{map, named_reference, reference, unit_vector};
+use crate::support::{self, FakeSource, picture};
 use bytes::Bytes;
 use placeformer::config::Config;
 use placeformer::pipeline::{IngestRequest, QueryOptions, QueryRequest, Service};
@@ -17,12 +15,10 @@ use placeformer_store::{
     Inserted, PlaceStore, ReferencePatch, SqliteStore, StoreConfig, apply_patch,
 };
 use placeformer_vision::search::{IndexBuilder, IndexEntry, MapIndex};
-use places::{map, named_reference, reference, unit_vector};
 use proptest::prelude::*;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use support::{FakeSource, picture};
 use time::OffsetDateTime;
 
 // ---------------------------------------------------------------- any history

@@ -1,0 +1,11 @@
+//! From pixels to recognised places: what images are accepted, that extraction gives what the
+//! reference implementation gives, and that a town is recognised.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod allocations;
+mod golden_extract;
+mod image_golden;
+mod image_inputs;
+mod town;
