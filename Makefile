@@ -37,7 +37,7 @@ calibration: ## Fit the default model's calibration again (CAMVID=DIR; models/)
 	CAMVID="$(CAMVID)" PLACEFORMER=$(RELEASE_BIN) models/make_calibration.sh
 
 .PHONY: bench
-bench: ## Measure every stage beside its baselines
+bench: ## Measure every stage next to its baselines
 	cargo build --release --locked
 	$(RELEASE_BIN) bench
 
@@ -117,7 +117,7 @@ valgrind: ## The kernels' tests under valgrind (needs it installed)
 	     $(PYTHON) -c 'import json,sys; print([m["executable"] for m in map(json.loads, sys.stdin) if m.get("executable")][-1])')" \
 	  --test-threads 1
 
-# The stable compiler has the sanitizer, but refuses its flag unless it is told otherwise.
+# The stable compiler has the sanitizer, but takes its flag only with RUSTC_BOOTSTRAP.
 .PHONY: asan
 asan: ## The kernels' tests under AddressSanitizer
 	RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address cargo test --locked --package placeformer-kernels --lib \
