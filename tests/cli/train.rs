@@ -172,15 +172,13 @@ fn the_last_block_is_trained_on_varied_images_of_drives() {
     let mut arguments: Vec<&str> = text.split_whitespace().collect();
     arguments.push(SIZE);
     let said = succeeds(folder.path(), &arguments);
-    let (weights, head) = (
-        folder.path().join("blocks/weights.safetensors"),
-        folder.path().join("blocks/head.safetensors"),
-    );
+    let weights = folder.path().join("blocks/weights.safetensors");
+    let head = folder.path().join("blocks/head.safetensors");
     assert!(
         said.contains("blocks/weights.safetensors") && weights.exists(),
         "{said}"
     );
-    // Bound to the weights beside it, whichever were kept.
+    // The head is bound to the weights that were written with it.
     let weights = VitWeights::load(&weights, Preset::Dinov2Vits14, None).unwrap();
     let bound = format!("dinov2-vits14:{}:b8", &weights.content_hash()[..12]);
     assert_eq!(Head::load(&head).unwrap().backbone(), bound);

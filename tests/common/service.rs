@@ -130,7 +130,8 @@ pub const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Waits until `condition` holds.
 pub fn until(what: &str, condition: impl Fn() -> bool) -> impl Future<Output = ()> {
-    let (what, began) = (what.to_owned(), std::time::Instant::now());
+    let what = what.to_owned();
+    let began = std::time::Instant::now();
     async move {
         while !condition() {
             assert!(began.elapsed() < PATIENCE, "{what} never came about");
@@ -144,7 +145,7 @@ impl FakeSource {
         Self::made(ModelId::new(model), None)
     }
 
-    /// One whose global descriptors are its pooled tokens behind `head`.
+    /// A source whose global descriptors are its pooled tokens, projected by `head`.
     pub fn with_head(head: Head) -> Arc<Self> {
         let headless = ModelId::new(format!("{BACKBONE}:{SIZE}:t1:k48-12-4:hnone"));
         Self::made(head.rebind(&headless).unwrap(), Some(head))
@@ -219,7 +220,7 @@ impl DescriptorSource for FakeSource {
     }
 }
 
-/// Whose tokens the fake ones pretend to be.
+/// The backbone that the fake tokens pretend to come from.
 pub const BACKBONE: &str = "fake:0123456789ab:b8";
 
 /// A head for `backbone`, drawn from `seed`.
@@ -431,10 +432,8 @@ fn start(
     source: Arc<dyn DescriptorSource>,
     config: Config,
 ) -> (AppState, Arc<Service>) {
-    let (metrics, health) = (
-        Arc::new(Metrics::new().unwrap()),
-        Arc::new(Health::default()),
-    );
+    let metrics = Arc::new(Metrics::new().unwrap());
+    let health = Arc::new(Health::default());
     let limit = config.image.max_bytes;
     let state = AppState::new(
         config.http.clone(),

@@ -5,7 +5,11 @@
 mod common;
 
 mod allocations;
+mod golden;
 mod golden_extract;
+mod image_exif;
 mod image_golden;
 mod image_inputs;
+mod image_limits;
+mod pictures;
 mod town;
