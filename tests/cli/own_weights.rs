@@ -2,13 +2,16 @@
 //! from: the real binary.
 
 use crate::common::noise;
-use crate::common::program::{Server, offline, refused_by};
+use crate::common::program::{Server, offline, refused_by, words};
 use crate::common::weights::made_up;
 use placeformer_core::types::{GLOBAL_DIM, ImageSize};
 use placeformer_models::open_extractor;
 use placeformer_vision::extract::{Aggregate, ExtractConfig, Head, HeadChoice, Preset, VitWeights};
 use std::path::PathBuf;
 use std::process::Command;
+
+/// A server on a free port, with its data in the folder `data`.
+const SERVE: &str = "serve --listen 127.0.0.1:0 --data data";
 
 /// The paper's geometry, of which no weights are published, with made-up values.
 fn weights() -> VitWeights {
@@ -89,27 +92,16 @@ fn weights_and_head_of_ones_own_are_served_and_imported_with() {
     for seed in 0..2 {
         std::fs::write(photos.join(format!("{seed}.png")), picture(seed)).unwrap();
     }
-    let flags = [
-        "--weights",
-        "weights.safetensors",
-        "--head",
-        "head.safetensors",
-        "--precision",
-        "f32",
-    ];
-    let import = [
-        &["import", "photos", "--map", "m", "--data", "data"],
-        &flags[..],
-    ]
-    .concat();
+    let flags = words("--weights weights.safetensors --head head.safetensors --precision f32");
+    let import = [words("import photos --map m --data data"), flags.clone()].concat();
     let imported = own.command(&import).output().unwrap();
     assert!(
         imported.status.success(),
         "{}",
         String::from_utf8_lossy(&imported.stderr)
     );
-    let serve = ["serve", "--listen", "127.0.0.1:0", "--data", "data"];
-    let server = Server::start(own.command(&[&serve, &flags[..]].concat()));
+    let serve = [words(SERVE), flags].concat();
+    let server = Server::start(own.command(&serve));
     assert_eq!(server.get("/info")["model"], own.model.as_str());
     assert_eq!(
         server
@@ -130,15 +122,8 @@ fn weights_and_head_of_ones_own_are_served_and_imported_with() {
 #[test]
 fn the_variable_that_other_commands_read_counts_for_the_server_too() {
     let own = Own::new();
-    let mut command = own.command(&[
-        "serve",
-        "--listen",
-        "127.0.0.1:0",
-        "--data",
-        "data",
-        "--head",
-        "head.safetensors",
-    ]);
+    let serve = [words(SERVE), words("--head head.safetensors")].concat();
+    let mut command = own.command(&serve);
     command.env("PLACEFORMER_WEIGHTS", own.path("weights.safetensors"));
     assert_eq!(
         Server::start(command).get("/info")["model"],
@@ -149,23 +134,20 @@ fn the_variable_that_other_commands_read_counts_for_the_server_too() {
 #[test]
 fn a_server_that_could_not_search_does_not_start_and_says_what_to_set() {
     let own = Own::new();
-    let serve = ["serve", "--listen", "127.0.0.1:0", "--data", "data"];
     for (flags, parts) in [
-        (&["--head", "none"][..], &["extract.head", "head fit"][..]),
+        ("--head none", &["extract.head", "head fit"][..]),
         (
-            &[],
+            "",
             &["no weights are published", "--weights", "extract.weights"],
         ),
         (
-            &["--weights", "weights.safetensors"],
+            "--weights weights.safetensors",
             &["no head is built in", "--head", "extract.head"],
         ),
-        (
-            &["--weights", "missing.safetensors"],
-            &["missing.safetensors"],
-        ),
+        ("--weights missing.safetensors", &["missing.safetensors"]),
     ] {
-        let error = refused_by(&mut own.command(&[&serve, flags].concat()));
+        let serve = [words(SERVE), words(flags)].concat();
+        let error = refused_by(&mut own.command(&serve));
         assert!(
             parts.iter().all(|part| error.contains(part)),
             "{flags:?}: {error}"
@@ -189,14 +171,7 @@ fn flags_win_over_variables_and_variables_over_the_file() {
     let folder = tempfile::tempdir().unwrap();
     let text = "[http]\nmax_page = 11\nmax_connections = 12\n[log]\nfilter = \"warn\"\n";
     std::fs::write(folder.path().join("placeformer.toml"), text).unwrap();
-    let arguments = [
-        "serve",
-        "--print-config",
-        "--config",
-        "placeformer.toml",
-        "--log",
-        "error",
-    ];
+    let arguments = words("serve --print-config --config placeformer.toml --log error");
     let mut printing = offline(folder.path(), &arguments);
     printing
         .env("PLACEFORMER_HTTP__MAX_CONNECTIONS", "13")

@@ -33,6 +33,11 @@ pub fn has_model() -> bool {
     true
 }
 
+/// A command line's arguments, none of which contains a space.
+pub fn words(command_line: &str) -> Vec<&str> {
+    command_line.split_whitespace().collect()
+}
+
 /// The program in `folder`, without the settings that the environment of the tests may hold.
 pub fn command(folder: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
