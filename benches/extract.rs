@@ -1,5 +1,5 @@
 //! Extraction of one image at the default preset: the fused encoder at every level and precision of
-//! this CPU, beside the candle one. Weights are random, which costs the same as learned ones.
+//! this CPU, compared with the candle one. Weights are random, which cost the same as learned ones.
 
 #[path = "../tests/common/noise.rs"]
 #[allow(dead_code, reason = "the tests use all of it")]
