@@ -155,7 +155,7 @@ impl Server {
 
     #[track_caller]
     fn wait_until_ready(&self) {
-        let readyz = format!("{}/readyz", self.url);
+        let readyz = format!("{}/readyz?for=query", self.url);
         let began = Instant::now();
         loop {
             let answer = self.http.get(&readyz).send();
