@@ -19,7 +19,7 @@ const SETTINGS: RansacSettings = RansacSettings {
 /// A file of the reference's outputs; see the README beside it.
 fn golden(name: &str) -> Vec<u8> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../../tests/golden")
+        .join("tests/golden")
         .join(name);
     std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
