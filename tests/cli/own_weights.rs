@@ -13,6 +13,19 @@ use std::process::Command;
 /// A server on a free port, with its data in the folder `data`.
 const SERVE: &str = "serve --listen 127.0.0.1:0 --data data";
 
+/// A configuration that names the geometry, and neither weights nor head.
+const SETTINGS: &str = r#"
+[extract]
+preset = "placeformer-vits16"
+input_size = { width = 64, height = 48 }
+
+[pipeline]
+disk_reserve_bytes = 0
+
+[store]
+reserve_bytes = 1048576
+"#;
+
 /// The paper's geometry, of which no weights are published, with made-up values.
 fn weights() -> VitWeights {
     let preset = Preset::PlaceformerVits16;
@@ -60,9 +73,7 @@ impl Own {
             ..config
         })
         .unwrap();
-        let text = "[extract]\npreset = \"placeformer-vits16\"\ninput_size = { width = 64, height = 48 }\n\
-                    [pipeline]\ndisk_reserve_bytes = 0\n[store]\nreserve_bytes = 1048576\n";
-        std::fs::write(folder.path().join("placeformer.toml"), text).unwrap();
+        std::fs::write(folder.path().join("placeformer.toml"), SETTINGS).unwrap();
         Self {
             model: with_head.model_id().to_string(),
             folder,

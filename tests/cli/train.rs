@@ -135,9 +135,11 @@ fn the_last_block_is_trained_on_varied_images_of_drives() {
         return;
     }
     let folder = town("8", "1");
-    let text = "train --trainable last-1 --drives town/database town/queries --positive-frames 1 --negative-frames 2 \
-                --validation-share 0.4 --steps 1 --mine-every 1 --warm-up 0 --batch 2 --out blocks --input-size";
-    let mut arguments = words(text);
+    let mut arguments = words(
+        "train --trainable last-1 --drives town/database town/queries --positive-frames 1 \
+         --negative-frames 2 --validation-share 0.4 --steps 1 --mine-every 1 --warm-up 0 --batch 2 \
+         --out blocks --input-size",
+    );
     arguments.push(SIZE);
     let said = succeeds(folder.path(), &arguments);
     let weights = folder.path().join("blocks/weights.safetensors");
