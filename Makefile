@@ -9,7 +9,8 @@ TEST_STEPS := fmt promtool deny clippy unit doc schemathesis compose
 PYTHON ?= python3
 FUZZ_SECONDS ?= 60
 MODEL ?= dinov2-vits14
-# The development profile is optimised, so one build serves every step of `make test`.
+# The development profile optimises the kernels and the model, so that one build serves every step
+# of `make test`.
 DEBUG_BIN := target/debug/placeformer
 RELEASE_BIN := target/release/placeformer
 IMAGE ?= placeformer:local
@@ -36,7 +37,7 @@ calibration: ## Fit the default model's calibration again (CAMVID=DIR; models/)
 	CAMVID="$(CAMVID)" PLACEFORMER=$(RELEASE_BIN) models/make_calibration.sh
 
 .PHONY: bench
-bench: ## Measure every stage beside its baselines
+bench: ## Measure every stage next to its baselines
 	cargo build --release --locked
 	$(RELEASE_BIN) bench
 
@@ -51,30 +52,31 @@ test: ## Everything CI runs, with durations
 	@MAKE=$(MAKE) tests/all.sh $(TEST_STEPS)
 
 .PHONY: check
-check: fmt clippy ## The quick round while you work
-	cargo test --locked --lib --test architecture
+check: fmt clippy ## The quick round: lints, unit tests without the lab's, architecture
+	cargo test --locked --workspace --exclude placeformer-lab --lib --test project
 
 .PHONY: fmt
 fmt: ## Formatting
-	cargo fmt --check
+	cargo fmt --all --check
 
 .PHONY: clippy
 clippy: ## Lints; warnings are errors
-	cargo clippy --locked --all-targets -- -D warnings
+	cargo clippy --locked --workspace --all-targets -- -D warnings
+	cargo clippy --locked --no-default-features --lib --bins -- -D warnings
 
 .PHONY: deny
 deny: .venv/tools ## Licences, bans and sources of dependencies
 	cargo fetch --locked
 	cargo fetch --locked --manifest-path fuzz/Cargo.toml
-	cargo deny --offline --all-features check bans licenses sources
+	cargo deny --offline --workspace --all-features check bans licenses sources
 
 .PHONY: advisories
 advisories: .venv/tools ## Known vulnerabilities (needs the network)
-	cargo deny --all-features check advisories
+	cargo deny --workspace --all-features check advisories
 
 .PHONY: unit
 unit: .venv/tools model ## Unit, property and behaviour tests
-	cargo nextest run --locked --no-fail-fast
+	cargo nextest run --locked --workspace --no-fail-fast
 	# As a release is built, without crash points: the variable that arms them must be ignored.
 	cargo nextest run --locked -p placeformer-store killed
 
@@ -84,8 +86,9 @@ simd: model ## The comparisons with stored outputs, at every level of SIMD
 
 .PHONY: doc
 doc: ## Examples in the documentation, and its links
-	cargo test --locked --doc
-	RUSTDOCFLAGS="-D warnings -A rustdoc::private_intra_doc_links" cargo doc --locked --no-deps --document-private-items --quiet
+	cargo test --locked --workspace --doc
+	RUSTDOCFLAGS="-D warnings -A rustdoc::private_intra_doc_links" \
+	  cargo doc --locked --workspace --no-deps --document-private-items --quiet
 
 .PHONY: model
 model: ## Obtain the model's weights
@@ -108,19 +111,19 @@ compose: model ## The composed system end to end (skips without Docker)
 fuzz: .venv/tools ## Each fuzz target for FUZZ_SECONDS (60)
 	fuzz/run.sh $(FUZZ_SECONDS)
 
-# Valgrind knows no AVX-512, so under it the kernels' tests stop at AVX2; the sanitizer covers every level. The stable
-# compiler carries the sanitizer but needs to be told that it may be used.
+# Valgrind knows no AVX-512, so under it the tests stop at AVX2; the sanitizer covers every level.
 .PHONY: valgrind
 valgrind: ## The kernels' tests under valgrind (needs it installed)
 	PROPTEST_CASES=4 valgrind --quiet --error-exitcode=1 \
-	  $$(cargo test --locked --lib --no-run --message-format json | \
-	     $(PYTHON) -c 'import json,sys; print([m["executable"] for m in map(json.loads, sys.stdin) if m.get("executable")][-1])') \
-	  kernels:: --test-threads 1
+	  "$$(cargo test --locked --package placeformer-kernels --lib --no-run --message-format json | \
+	     $(PYTHON) -c 'import json,sys; print([m["executable"] for m in map(json.loads, sys.stdin) if m.get("executable")][-1])')" \
+	  --test-threads 1
 
+# The stable compiler has the sanitizer, but takes its flag only with RUSTC_BOOTSTRAP.
 .PHONY: asan
 asan: ## The kernels' tests under AddressSanitizer
-	RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address cargo test --locked --lib --target-dir target/asan \
-	  --target x86_64-unknown-linux-gnu kernels::
+	RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address cargo test --locked --package placeformer-kernels --lib \
+	  --target-dir target/asan --target x86_64-unknown-linux-gnu
 
 .PHONY: clean
 clean: ## Remove everything made here

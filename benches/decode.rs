@@ -1,8 +1,8 @@
-//! From a 1080p JPEG to the model's tensor: ours beside the image crate alone.
+//! From a 1080p JPEG to the model's tensor, compared with the image crate alone.
 //!
 //! The picture is a rendered street, so that its entropy is that of a photo and nothing needs to be
-//! shipped. Set `PLACEFORMER_BENCH_JPEG` to measure another file, for instance beside another
-//! library on the same file.
+//! shipped. Set `PLACEFORMER_BENCH_JPEG` to measure another file, for instance to compare with
+//! another library on the same file.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use placeformer_core::types::ImageSize;

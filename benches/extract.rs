@@ -1,71 +1,34 @@
 //! Extraction of one image at the default preset: the fused encoder at every level and precision of
-//! this CPU, beside the candle one. Weights are random, which costs the same as learned ones.
+//! this CPU, compared with the candle one. Weights are random, which cost the same as learned ones.
+
+#[path = "../tests/common/noise.rs"]
+#[allow(dead_code, reason = "the tests use all of it")]
+mod noise;
+#[path = "../tests/common/weights.rs"]
+mod weights;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use placeformer_core::types::ImageTensor;
 use placeformer_kernels::Simd;
 use placeformer_vision::extract::{
-    BlockWeights, CandleEncoder, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm,
-    Precision, Preset, VitWeights,
+    CandleEncoder, Encoder, EncoderSpec, FusedEncoder, Precision, Preset,
 };
-use rand::{RngExt, SeedableRng};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-
-fn values(random: &mut ChaCha8Rng, len: usize, spread: f32) -> Vec<f32> {
-    (0..len)
-        .map(|_| spread * random.random_range(-1.0f32..1.0))
-        .collect()
-}
-
-fn linear(random: &mut ChaCha8Rng, outputs: usize, inputs: usize) -> Linear {
-    let spread = (inputs as f32).sqrt().recip();
-    Linear {
-        weight: values(random, outputs * inputs, spread),
-        bias: values(random, outputs, 0.1),
-    }
-}
-
-fn weights(preset: Preset) -> VitWeights {
-    let geometry = preset.geometry();
-    let Geometry { dim, mlp_dim, .. } = geometry;
-    let mut random = ChaCha8Rng::seed_from_u64(1);
-    let norm = || Norm {
-        weight: vec![1.0; dim],
-        bias: vec![0.0; dim],
-    };
-    let block = |random: &mut ChaCha8Rng| BlockWeights {
-        norm1: norm(),
-        qkv: linear(random, 3 * dim, dim),
-        proj: linear(random, dim, dim),
-        layer_scale1: Some(vec![0.5; dim]),
-        norm2: norm(),
-        fc1: linear(random, mlp_dim, dim),
-        fc2: linear(random, dim, mlp_dim),
-        layer_scale2: Some(vec![0.5; dim]),
-    };
-    VitWeights {
-        preset,
-        unused_parameters: 0,
-        geometry,
-        position_grid: (37, 37),
-        blocks: (0..geometry.depth).map(|_| block(&mut random)).collect(),
-        patch_embed: linear(&mut random, dim, 3 * geometry.patch * geometry.patch),
-        cls_token: values(&mut random, dim, 1.0),
-        positions: values(&mut random, (1 + 37 * 37) * dim, 0.1),
-        norm: norm(),
-    }
-}
+use weights::made_up;
 
 fn extract(criterion: &mut Criterion) {
     let preset = Preset::Dinov2Vits14;
-    let (weights, size, exit_block) = (weights(preset), preset.input_size(), preset.exit_block());
+    let weights = made_up(preset, preset.geometry(), (37, 37), 1);
+    let size = preset.input_size();
+    let exit_block = preset.exit_block();
     let spec = EncoderSpec {
         input_size: size,
         exit_block,
         token_norm: false,
         attention_block: exit_block,
     };
-    let pixels = values(
+    let pixels = noise::values(
         &mut ChaCha8Rng::seed_from_u64(2),
         3 * (size.width * size.height) as usize,
         2.0,

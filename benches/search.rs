@@ -62,8 +62,8 @@ fn search(criterion: &mut Criterion) {
         group
             .throughput(Throughput::Elements(size))
             .sample_size(if size > 100_000 { 30 } else { 60 });
-        let mut turn = queries.iter().cycle();
-        let mut next = || turn.next().map_or(&[][..], Vec::as_slice);
+        let mut cycle = queries.iter().cycle();
+        let mut next = || cycle.next().map_or(&[][..], Vec::as_slice);
         group.bench_function(BenchmarkId::new("index", size), |bencher| {
             bencher.iter_batched(
                 &mut next,

@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # Builds the image: `docker/build.sh [TAG]`.
 #
-# With the public base images at hand (here already, or to be pulled) it compiles inside. Otherwise it compiles outside,
-# makes a base from Debian's packages (root and debootstrap) and puts the binary on it. BASE and BUILDER choose other
-# images, BINARY a binary that is there already.
+# Where the public base images are at hand or can be pulled, the server is compiled inside a
+# container. Elsewhere it is compiled outside, and put on a base image made from Debian's packages,
+# which needs root and debootstrap. BASE and BUILDER choose other images; BINARY names a program
+# that is compiled already.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 tag=${1:-placeformer:local}
@@ -23,11 +24,13 @@ if [[ -z ${BINARY:-} ]] && have "$builder"; then
 fi
 if [[ -z ${BINARY:-} ]]; then
     echo "$builder cannot be had: compiling outside the container"
-    cargo build --release --locked
-    BINARY=target/release/placeformer
+    # In a folder of its own, because this program lacks the commands of the feature `lab`.
+    cargo build --release --locked --no-default-features --target-dir target/container
+    BINARY=target/container/release/placeformer
 fi
 context=$(mktemp -d)
 trap 'rm -rf "$context"' EXIT
 install -m 755 "$BINARY" "$context/placeformer"
-strip "$context/placeformer"
+# A development build carries debug information; function names are kept for backtraces.
+strip --strip-debug "$context/placeformer"
 docker build --file docker/Dockerfile --target prebuilt --build-arg BASE="$base" --tag "$tag" "$context"

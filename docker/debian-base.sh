@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Makes a base image from Debian's packages, for machines that reach no image registry: `docker/debian-base.sh TAG`.
+# Makes a base image from Debian's packages, for machines that cannot reach an image registry:
+# `docker/debian-base.sh TAG`.
 set -euo pipefail
 tag=$1
 [[ $(id -u) == 0 ]] || { echo "debootstrap needs root" >&2; exit 1; }

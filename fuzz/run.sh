@@ -1,12 +1,14 @@
 #!/usr/bin/env bash
-# Runs fuzz targets with AddressSanitizer: `fuzz/run.sh SECONDS [TARGET...]`, all targets without names.
-# A finding stops the run; its input is left in fuzz/artifacts/ (`cargo fuzz run TARGET FILE` repeats it).
+# Runs fuzz targets with AddressSanitizer: `fuzz/run.sh SECONDS [TARGET...]`; without names, all of
+# them.
+# A finding stops the run and leaves its input in fuzz/artifacts/ (`cargo fuzz run TARGET FILE`
+# repeats it).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 seconds=$1
 shift
 [[ -x ../.venv/bin/cargo-fuzz ]] && PATH="$(cd ../.venv/bin && pwd):$PATH"
-# Sanitizers are unstable options of the one, stable, toolchain the project uses.
+# Sanitizers are unstable options, and the project uses the stable toolchain only.
 export RUSTC_BOOTSTRAP=1
 if [[ $# == 0 ]]; then
     mapfile -t targets < <(cargo fuzz list --fuzz-dir .)

@@ -74,7 +74,7 @@ def image_seeds():
 
 
 def patch_blob(stride, columns, rows, counts, length=8):
-    """A blob of the layout that src/store/codec.rs describes."""
+    """A blob of the layout that crates/store/src/codec.rs describes."""
     n = sum(counts)
     blob = b"PFKP" + struct.pack("<HBBHHHHIII", 1, stride, 0, columns, rows, 14, length, *counts)
     blob += b"".join(struct.pack("<H", index) for count in counts for index in range(count))

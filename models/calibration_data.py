@@ -1,13 +1,16 @@
 #!/usr/bin/env python3
-"""Lays out photographs and drawn towns as one data set with known and unknown places, to fit a calibration on.
+"""Lays out photographs and drawn towns as one data set with mapped and unmapped places.
 
     calibration_data.py OUT --drives DIR --town DIR [--town DIR ...] --stranger DIR
 
-DRIVES holds one folder of frames per drive, named by their number in a video of 30 frames a second; parts denser than
-a frame a second are thinned. Along each drive, stretches are mapped and stretches between them are not: frames within
-15 of each other show the same place, frames farther apart do not, so gaps of 15 frames belong to neither. Towns come from `placeformer synth`; of the stranger only the queries are used,
-as places that nobody mapped. OUT gets database/, queries/ (links) and ground_truth.csv with an empty reference where
-no match exists.
+A calibration is fitted on it. DRIVES holds one folder of frames per drive, named by their number in
+a video of 30 frames a second. Parts denser than a frame a second are thinned. Along each drive,
+stretches that are mapped alternate with stretches that are not. Frames within 15 of each other show
+the same place and frames farther apart do not, so the gaps of 15 frames belong to neither.
+
+Towns come from `placeformer synth`. Of the stranger only the queries are used, as places that nobody
+mapped. OUT gets database/ and queries/ (links), and ground_truth.csv, where an empty reference says
+that the query has no match.
 """
 
 import argparse

@@ -1,17 +1,22 @@
 #!/usr/bin/env python3
-"""Divides photographs and drawn towns into what heads are made from and what they are chosen by, apart by place.
+"""Divides photographs and drawn towns by place: some to make heads from, others to choose among them.
 
     head_data.py OUT --drives DIR --town DIR ... --distractor DIR ...
 
-DRIVES holds one folder of frames per drive, named by their number in a video of 30 frames a second; parts denser than a
-frame a second are thinned. Along each drive whole stretches are learnt from, and whole stretches are held out; frames
-of the gaps between them are in neither.
+DRIVES holds one folder of frames per drive, named by their number in a video of 30 frames a second.
+Parts denser than a frame a second are thinned. Along each drive, stretches to learn from alternate
+with stretches that are held out. Frames of the gaps between them are in neither.
 
-OUT/train/ gets a folder of links for each stretch that is learnt from. OUT/drives/ and OUT/towns/ are data sets of held
-out places, with database/, queries/ and ground_truth.csv. In the drives every sixth frame is a reference, and only those
-within three frames of a query are right: its other neighbours, a few seconds on, are wrong. Every third frame of what
-is learnt from is a reference, too, that nobody asks for: it tells nothing of the places that are asked for. The towns
-come from `placeformer synth`; of distractors only the database is used, as places that are mapped and never asked for.
+OUT/train/ gets a folder of links for each stretch to learn from. OUT/drives/ and OUT/towns/ are data
+sets of held-out places, with database/, queries/ and ground_truth.csv.
+
+In the drives, every sixth held-out frame is a reference. Only references within three frames of a
+query are right; its other neighbours, a few seconds away, are wrong. Every third frame of the
+stretches to learn from is a reference, too. No query shows its place, so it reveals nothing about
+the places that queries show.
+
+The towns come from `placeformer synth`. Of distractors only the database is used, as places that are
+mapped and that no query shows.
 """
 
 import argparse

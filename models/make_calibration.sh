@@ -1,7 +1,12 @@
 #!/usr/bin/env bash
-# Fits the default model's calibration again, on street photographs and on towns drawn here, with known and unknown
-# places of both. CAMVID names a folder with one folder of frames in order per drive (the four CamVid drives were used);
-# never a set that recall is reported on. The program carries the result from its next build on.
+# Fits the default model's calibration again, on street photographs and on towns drawn here, with
+# mapped and unmapped places of both.
+#
+#   make calibration CAMVID=DIR
+#
+# CAMVID names a folder with one folder of frames per drive, in order (the four CamVid drives were
+# used). It must never be a data set on which recall is reported. The program contains the new
+# calibration from its next build on.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 placeformer=${PLACEFORMER:-target/release/placeformer}
@@ -12,7 +17,7 @@ if [ -z "${CAMVID:-}" ] || [ ! -d "$CAMVID" ]; then
 fi
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
-# Town 1 is among the pictures that the head was fitted on, town 7 is the demo's.
+# Town 1 is among the pictures that the head was fitted on, and town 7 is the demo's.
 for town in 11 12 13; do
   "$placeformer" synth --out "$work/town$town" --places 40 --views 2 --seed "$town"
 done

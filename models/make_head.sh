@@ -1,12 +1,17 @@
 #!/usr/bin/env bash
-# Makes several heads on photographs and on towns drawn here, chooses the default among them by recall on places that
-# none has seen, and writes the choice down in models/selection.md. About a quarter of an hour on two cores.
+# Makes several heads on photographs and on towns drawn here, chooses the default among them by
+# recall on places that none of them has seen, and records the choice in models/selection.md. This
+# takes about a quarter of an hour on two cores.
 #
 #   make head CAMVID=DIR
 #
-# CAMVID names a folder with one folder of frames in order per drive (the four CamVid drives were used); never a set that
-# recall is reported on. WORK keeps what is computed, so that an interrupted run goes on; RESULT is where the head and
-# its table go; PLACES and MODEL_FLAGS make a quick trial of this script (smaller towns, `--input-size 112x84`).
+# CAMVID names a folder with one folder of frames per drive, in order (the four CamVid drives were
+# used). It must never be a data set on which recall is reported. Further variables:
+#
+#   WORK         keeps what is computed, so that an interrupted run can be continued
+#   RESULT       where the head and its table are written
+#   PLACES, MODEL_FLAGS
+#                make a quick trial of this script: fewer places, `--input-size 112x84`
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 if [ -z "${CAMVID:-}" ] || [ ! -d "$CAMVID" ]; then
@@ -27,18 +32,18 @@ else
   work=$(mktemp -d)
   trap 'rm -rf "$work"' EXIT
 fi
-# From here on paths are relative, so that what a head says of its making is the same everywhere.
+# From here on paths are relative, so that what a head records of its making is the same everywhere.
 cd "$work"
 
-# The tables are written last, so a town that has them is complete.
+# The tables are written last, so that a town which has them is complete.
 town() {
   [ -f "$1/positions.csv" ] || { rm -rf "$1"; "$placeformer" synth --out "$@"; }
 }
-# Town 7 is the demo's, 11 to 13 are the calibration's.
+# Town 7 is the demo's, and towns 11 to 13 are the calibration's.
 for seed in 1 2; do town "learnt$seed" --places "$places" --views 2 --seed "$seed"; done
 town learnt3 --places $((places * 3 / 2)) --views 3 --seed 3
 for seed in 21 22; do town "held$seed" --places "$places" --views 3 --conditions dusk,dusk,overcast --seed "$seed"; done
-# Says when to stop training; it takes no part in the choice.
+# This town decides when training stops, and takes no part in the choice.
 town validation31 --places "$places" --views 3 --conditions dusk,dusk,overcast --seed 31
 for seed in 23 24; do town "distractor$seed" --places "$places" --views 2 --seed "$seed"; done
 rm -rf train drives towns
@@ -46,13 +51,15 @@ python3 "$models/head_data.py" . --drives "$camvid" \
   --town held21 --town held22 --distractor distractor23 --distractor distractor24
 
 mkdir -p heads results
-# Pictures of a third town make every PCA recall less, on photographs and in towns; triplets need them.
+# With pictures of a third town, every PCA head has lower recall, on photographs and in towns.
+# Triplets need them.
 for aggregate in mean gem vlad; do
   [ -f "heads/pca-$aggregate.safetensors" ] || "$placeformer" head fit "${flags[@]}" --aggregate "$aggregate" \
     --images train learnt1 learnt2 --out "heads/pca-$aggregate.safetensors"
 done
 [ -f heads/triplets-mean.safetensors ] || {
-  # The paper's margin of 0.01 is met by nearly every triplet before the first step: there is nothing to learn from.
+  # Nearly every triplet satisfies the paper's margin of 0.01 before the first step, which leaves
+  # nothing to learn from.
   "$placeformer" head train "${flags[@]}" --head heads/pca-mean.safetensors --cache cache/pooled --margin 0.3 \
     --patience 15 --drives train/* --dataset csv --root learnt1 --dataset csv --root learnt2 --dataset csv --root learnt3 \
     --validation-dataset csv --validation-root validation31 --out run
@@ -72,8 +79,8 @@ done
 count() { find -L "$@" -name '*.jpg' | wc -l; }
 python3 "$models/select_head.py" results --heads heads --sets drives towns --baseline no-head \
   --table "$result/selection.md" --winner "$result/dinov2-vits14-b8.safetensors" \
-  --data "Made from $(count train) frames of CamVid stretches and $(count learnt1 learnt2) pictures of two drawn towns, \
-the triplets also of $(count learnt3) of a third. \
-Chosen by other stretches of the drives, among $(count drives/database) references of which most show places that nobody \
-asks for, and by two other towns, seen from further sides and mostly at dusk, among $(count towns/database) references \
-of four towns."
+  --data "Made from $(count train) frames of CamVid stretches and $(count learnt1 learnt2) pictures \
+of two drawn towns, the triplets also from $(count learnt3) of a third. Chosen by other stretches of \
+the drives, among $(count drives/database) references of which most show places that no query shows, \
+and by two other towns, seen from further sides and mostly at dusk, among \
+$(count towns/database) references of four towns."

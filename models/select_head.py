@@ -3,17 +3,21 @@
 
     select_head.py RESULTS --heads DIR --sets NAME ... --baseline NAME --table FILE --winner FILE
 
-RESULTS holds what `placeformer eval --json` wrote, one NAME-of-head.NAME-of-set.json each; DIR the heads by name. The
-score of a head is the mean of R@1 and R@10 before re-ranking, averaged over the sets with equal weight. A paired
-bootstrap over queries says whether the best is ahead of another beyond noise. Of the best and those it is not ahead of,
-the smallest stored vector wins; among equally small ones the mean, which maps that are there can take; then the highest
-score. The baseline is shown and never chosen.
+RESULTS holds what `placeformer eval --json` wrote, one NAME-of-head.NAME-of-set.json for each head and
+set, and DIR holds the heads by name. The score of a head is the mean of R@1 and R@10 before
+re-ranking, averaged over the sets with equal weight. A paired bootstrap over queries says whether the
+best head leads another by more than noise.
+
+The best head and those that it does not lead by more than noise are level. Among them the smallest
+stored vector wins. Among equally small ones the mean wins, because existing maps can take it without
+their images. Then the score decides. The baseline is shown and never chosen.
 """
 
 import argparse
 import json
 import random
 import shutil
+import textwrap
 from pathlib import Path
 
 RESAMPLES, SEED = 2000, 0
@@ -92,6 +96,10 @@ def table(heads, sets, leads, best):
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
+def bullet(text):
+    return textwrap.fill(f"- {text}", 99, subsequent_indent="  ", break_on_hyphens=False)
+
+
 def explain(heads, baseline, sets, data):
     winner, best, leads = choose(heads, sets)
     size = heads[winner][sets[0]].pooled_bytes
@@ -103,26 +111,29 @@ def explain(heads, baseline, sets, data):
         more = heads[best][sets[0]].pooled_bytes
         reason = f"{ahead}, and a reference keeps {more / 1000:.1f} kB with it instead of {size / 1000:.1f} kB."
     else:
-        reason = f"{ahead}, and maps whose tokens were pooled by their mean can take the latter without their images."
+        reason = f"{ahead}, and existing maps, which keep means, can take the latter without their images."
     counts = ", ".join(f"{len(heads[winner][s].queries)} queries in {s}" for s in sets)
     text = f"""# How the default head was chosen
 
-Written by `make head`; do not edit. Recalls are in percent, on held-out places: {counts}.
+Written by `make head`; do not edit. Recalls are in percent, on held-out places:
+{counts}.
 
 {table({**baseline, **heads}, sets, leads, best)}
 
 **Chosen: {winner}.** {reason}
 
-- The score is the mean of R@1 and R@10 before re-ranking, averaged over the sets. Re-ranking depends on the head only
-  through the candidates it is given, so its columns are shown and do not decide.
-- The last column is the 95% interval of the best head's lead in score, by a paired bootstrap over queries
-  ({RESAMPLES} resamples). A head whose interval reaches 0 counts as level with the best. Among level heads the smallest
-  stored vector wins: each reference keeps its pooled tokens for the next head, 12.3 kB with a VLAD beside some 117 kB
-  of key patches, and the head itself costs sixteen times as much to apply. Among equally small ones the mean comes
-  first, because the maps there are keep means and can take it without their images; then the score decides.
-- {data}
-- There is no indoor set at hand, so nothing here speaks for buildings from within.
-- Sets that recall is reported on (CMU Seasons, Fordham) took no part.
+- The score is the mean of R@1 and R@10 before re-ranking, averaged over the sets. A head affects
+  re-ranking only through the candidates that it finds, so the re-ranked columns are shown and do
+  not decide.
+- The last column is the 95% interval of the best head's lead in score, by a paired bootstrap over
+  queries ({RESAMPLES} resamples). A head whose interval reaches 0 counts as level with the best.
+  Among level heads the smallest stored vector wins, because each reference keeps its pooled tokens
+  for the next head: 12.3 kB with a VLAD, next to about 117 kB of key patches, and applying the head
+  costs sixteen times as much. Among equally small ones the mean wins, because existing maps keep
+  means and can take it without their images. Then the score decides.
+{bullet(data)}
+- No indoor set is at hand, so nothing here says how the heads do inside buildings.
+- The sets on which recall is reported (CMU Seasons, Fordham) were not used.
 """
     return winner, text
 

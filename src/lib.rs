@@ -30,7 +30,8 @@
 //! | `placeformer-store` | references and their descriptors on disk |
 //! | `placeformer-lab` | data sets, evaluation, training, drawn streets, benchmarks |
 //!
-//! `tests/architecture.rs` keeps what Cargo cannot: `http -> pipeline`, and axum only in `http`.
+//! `tests/project/architecture.rs` keeps what Cargo cannot: `http -> pipeline`, and axum only in
+//! `http`.
 
 pub mod cli;
 pub mod config;

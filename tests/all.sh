@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Everything CI runs, one make target after the other. Stops at the first failure; says how long each took.
+# Runs everything that CI runs, one make target after the other. It stops at the first failure and
+# says how long each step took.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 logs=target/test-logs
@@ -11,7 +12,8 @@ report() {
     printf '\n%-14s %8s  %s\n' step seconds outcome
     printf '%s\n' "${summary[@]}"
     printf '%-14s %8d\n\n' total $((SECONDS - began))
-    # The runner's own closing line, so that whoever reads only the end knows how many tests ran.
+    # Repeats the test runner's closing line here, so that the end of the output says how many
+    # tests ran.
     sed 's/\x1b\[[0-9;]*m//g' "$logs/unit.log" 2>/dev/null | grep -E '^ +Summary \[' || true
 }
 

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Checks what Prometheus will read: its configuration, the alert rules, and the rules' own tests.
-# promtool comes from the system, or is unpacked (not installed) from Debian's package into .tools.
+# promtool comes from the system. Otherwise it is unpacked from Debian's package into .tools, without
+# being installed.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 

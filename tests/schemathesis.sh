@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Drives a live server with requests derived from its own OpenAPI document: no 5xx, no answer the document does not
-# describe. Makes its own Python environment; the server listens on a free loopback port and keeps its data in a
-# temporary directory.
+# Sends a live server requests that are derived from its own OpenAPI document. It must not answer with
+# a 5xx, nor with anything that the document does not describe. The script makes its own Python
+# environment. The server listens on a free loopback port, with its data in a temporary directory.
 #
 #   BIN=path/to/placeformer   the program to test (default: build and use target/debug/placeformer)
 #   VENV=dir                  Python environment (default: .venv)
@@ -10,7 +10,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 if [ -z "${BIN:-}" ]; then
-  cargo build --quiet
+  cargo build --quiet --locked
   BIN="${CARGO_TARGET_DIR:-target}/debug/placeformer"
 fi
 VENV="${VENV:-.venv}"
@@ -31,7 +31,7 @@ finish() {
 }
 trap finish EXIT
 
-# A busy machine may take long over a photo; that is not what is tested here.
+# A photo may take long on a busy machine, which is not what is tested here.
 export PLACEFORMER_PIPELINE__DEADLINE_MS=120000 PLACEFORMER_PIPELINE__MAX_WAIT_MS=60000
 "$BIN" serve --listen 127.0.0.1:0 --data "$work/data" >"$work/address" 2>"$work/log" &
 server=$!
@@ -50,8 +50,8 @@ photo=("$work"/town/queries/*.jpg)
 reference="$(curl -sf "$url/references?map=town" | sed -n 's/.*"id":"\([^"]*\)".*/\1/p')"
 export PYTHONPATH=tests SCHEMATHESIS_HOOKS=schemathesis_hooks
 
-# A string of random bytes satisfies the schema of an image body, but is no image: `positive_data_acceptance` cannot
-# hold for uploads.
+# Random bytes satisfy the schema of an image body but are no image, so that the check
+# `positive_data_acceptance` cannot hold for uploads.
 run() {
   "$VENV/bin/st" run "$url/openapi.json" --checks all --exclude-checks "$1" --phases examples,coverage,fuzzing \
     --max-examples "${MAX_EXAMPLES:-15}" --seed 1 --no-shrink --continue-on-failure

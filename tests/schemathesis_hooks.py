@@ -1,11 +1,11 @@
-"""Keeps generated requests from failing by right: deadlines leave time, and photos are photos.
+"""Changes generated requests that would rightly fail: deadlines leave enough time, and photos are photos.
 
-Every sound deadline becomes the server's longest: how long a photo takes is the machine's affair, and an answer that
-comes too late is a 504 by right.
+Every valid deadline becomes the longest that the server takes. How long a photo takes depends on the
+machine, and an answer that comes too late is rightly a 504.
 
-With PHOTO, MAP and REFERENCE in the environment, two thirds of the well-formed requests get these, so that they get
-beyond validation: the document can say that a body is an image, but not what makes bytes one, and no generator guesses
-an id.
+With PHOTO, MAP and REFERENCE in the environment, two thirds of the well-formed requests get these, so
+that they pass validation: the OpenAPI document can say that a body is an image, but not which bytes
+are one, and a generator cannot guess an id.
 """
 
 import base64

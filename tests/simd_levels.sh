@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# The tests that compare with stored outputs, at every level of SIMD that this CPU has. What the service falls back to on
-# an older CPU is thereby held to the same tolerances.
+# Runs the tests that compare with stored outputs at every level of SIMD that this CPU has, so that
+# what the service falls back to on an older CPU keeps to the same tolerances.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bin=${BIN:-target/debug/placeformer}
@@ -13,7 +13,8 @@ for level in scalar avx2 avx512 amx; do
         esac
     fi
     echo "level $level"
-    PLACEFORMER_SIMD=$level cargo nextest run --locked --test golden_extract --lib -E 'binary(golden_extract) or test(golden)'
+    PLACEFORMER_SIMD=$level cargo nextest run --locked --package placeformer \
+        --package placeformer-vision --test recognition --lib -E 'test(golden)'
     ran=$((ran + 1))
 done
 [ "$ran" -gt 0 ]

@@ -177,7 +177,7 @@ def main():
     tokens = [run(pixels[:1])[0] for run in runners.values()]
     difference = float(np.abs(tokens[0] - tokens[1]).max())
     assert difference < 1e-2, f"the engines disagree by {difference}"
-    # Less exact ones are not held to the tolerance above.
+    # The tolerance above does not apply to less exact ones.
     runners["openvino-bf16"] = openvino_runner(model, arguments.threads, "bf16")
     if arguments.int8:
         runners["openvino-int8"] = openvino_runner(model, arguments.threads, "bf16", pixels)

@@ -8,7 +8,8 @@ verifies them (OpenCV, USAC_MAGSAC) and ranks by the inliers. There is no HTTP i
     pip install -r benches/peers/requirements.txt
     placeformer bench --end-to-end --peers PYTHON
 
-which draws the photos, runs this file beside its own measurement and reads the one JSON object it prints.
+The second command draws the photos, runs this file next to its own measurement, and reads the JSON object that this
+file prints.
 """
 
 import argparse

@@ -2,7 +2,7 @@
 
 Matching: numpy GEMM + argmax both ways. Verification: OpenCV's RANSAC and USAC_MAGSAC. Tolerance 21 px, at most 2000
 iterations, confidence 0.995, as ours. Prints milliseconds for 100 candidates (candidates over 2 threads for OpenCV,
-BLAS's own threads for numpy) and the inliers found, ours beside them on the same matches.
+BLAS's own threads for numpy) and the inliers found, next to ours on the same matches.
 
     pip install numpy==2.4.6 opencv-python-headless==5.0.0.93 safetensors==0.8.0
     PLACEFORMER_BENCH_EXPORT=DIR cargo bench --bench rerank

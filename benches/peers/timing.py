@@ -1,4 +1,4 @@
-"""How long a run takes, for the peers that stand beside extraction and decoding."""
+"""How long a run takes, for the peers that extraction and decoding are compared with."""
 
 import statistics
 import time

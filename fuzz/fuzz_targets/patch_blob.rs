@@ -1,7 +1,7 @@
 //! Patch blobs: damaged bytes are refused; what is accepted is written back as the same bytes.
 //!
-//! A checksum turns nearly every mutation away at the door, so the second half of the rounds
-//! repairs it first: that lets the mutations reach the checks behind it.
+//! Nearly every mutation fails the checksum. So each input is also tried with its checksum repaired,
+//! which lets the mutation reach the checks behind it.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;

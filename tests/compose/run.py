@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
 """Drives the composed system end to end, as an operator would.
 
-Ingest, query, the numbers read back through the real Prometheus, a container killed in the middle of ingest and
-restarted with nothing lost, a restart that a patient client does not notice, and replicas replaced one after the other
-without one failed query. Skips, saying why, where there is no Docker engine.
+It ingests and queries, reads the metrics back through the real Prometheus, kills a container in the
+middle of ingest and checks that nothing is lost, restarts the service without a failure for a client
+that retries, and replaces replicas one after the other without a failed query. Where there is no
+Docker engine it is skipped and says why.
 """
 
 import argparse
@@ -43,7 +44,7 @@ class Checks:
         container = self.stack.container("placeformer")
         check(run("docker", "exec", container, "id", "-u").strip() == "10001", "the service does not run as its own user")
         written = run("docker", "exec", container, "touch", "/usr/local/bin/x", check=False)
-        check(written.returncode != 0, "a file could be written beside the binary")
+        check(written.returncode != 0, "a file could be written next to the binary")
         processes = run("docker", "exec", container, "cat", "/proc/1/comm").strip()
         check(processes == "placeformer", f"process 1 is {processes}")
 
@@ -103,7 +104,7 @@ class Checks:
         check(not firing, f"a healthy system fires {firing}")
 
     def killed_during_ingest_loses_nothing(self):
-        """Three clients ingest while the container is killed; what they were told is stored must be there after."""
+        """Three clients ingest while the container is killed; what was acknowledged must be there afterwards."""
         lock, stop = threading.Lock(), threading.Event()
 
         def feed(first):
@@ -138,7 +139,7 @@ class Checks:
         stored = {reference["external_id"]: reference["id"] for reference in client.references(port, MAP)}
         lost = {name: id_ for name, id_ in self.acknowledged.items() if stored.get(name) != id_}
         check(not lost, f"{len(lost)} of {len(self.acknowledged)} acknowledged references are lost: {sorted(lost)[:5]}")
-        # A write whose answer was cut off may be stored; nobody was promised it.
+        # A write whose answer was cut off may be stored or not: it was not acknowledged.
         check(len(stored) <= len(self.acknowledged) + 3, f"{len(stored)} references from {len(self.acknowledged)} answers")
 
     def a_restart_is_a_pause_for_a_patient_client(self):

@@ -1,9 +1,9 @@
 //! The service through its HTTP surface, with a real store and descriptors that need no weights.
 
-#[path = "../common/small_disk.rs"]
-mod small_disk;
-#[path = "../support/mod.rs"]
-mod support;
+#[path = "../common/mod.rs"]
+mod common;
+
+use common::{service as support, small_disk};
 
 mod admission;
 mod backup;
@@ -13,6 +13,7 @@ mod connection;
 mod damage;
 mod disk;
 mod errors;
+mod index_rebuild;
 mod killed;
 mod logs;
 mod process;

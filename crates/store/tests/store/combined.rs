@@ -4,7 +4,7 @@ use crate::places::{map, reference};
 use crate::support::{create, fresh};
 use placeformer_store::{
     CombinedStore, Damage, Footprint, Inserted, MaintainPlaces, PlaceStore, Quarantined,
-    ReadPlaces, StoreError, VerifyReport, WritePlaces,
+    ReadPlaces, StoreError, VerifyReport,
 };
 use std::path::Path;
 use std::sync::Arc;

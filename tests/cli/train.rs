@@ -1,27 +1,19 @@
 //! `train`, `head train`, `head fit` and `map rehead` from flags to files, on a small drawn town.
 
-#[path = "common/town.rs"]
-mod town;
-
+use crate::common::program::{SIZE, command, has_model, refusal, succeeds, town, words};
 use placeformer_store::{ReadPlaces, SqliteStore, StoreConfig};
 use placeformer_vision::extract::{Aggregate, Head, Preset, VitWeights};
 use std::path::Path;
-use std::process::Command;
-use town::{SERVED_SIZE, SIZE, has_model, refusal, succeeds, town};
 
-fn train(more: &[&'static str]) -> Vec<&'static str> {
-    let data = ["--dataset", "csv", "--root", "town", "--input-size", SIZE];
-    let run = [
-        "--cache",
-        "cache",
-        "--steps",
-        "20",
-        "--mine-every",
-        "5",
-        "--batch",
-        "4",
-    ];
-    [&["train"], &data[..], &run, more].concat()
+/// `train` on the town for 20 steps, with further arguments.
+fn train(more: &'static str) -> Vec<&'static str> {
+    let mut arguments = words(
+        "train --dataset csv --root town --cache cache --steps 20 --mine-every 5 --batch 4 \
+         --input-size",
+    );
+    arguments.push(SIZE);
+    arguments.extend(words(more));
+    arguments
 }
 
 #[test]
@@ -32,16 +24,7 @@ fn a_head_is_trained_continued_and_given_to_a_map() {
     let folder = town("8", "2");
     let folder = folder.path();
     // The margin is wide so that every triplet teaches something.
-    let command = train(&[
-        "--out",
-        "run",
-        "--learning-rate",
-        "0.01",
-        "--margin",
-        "0.5",
-        "--validation-share",
-        "0.3",
-    ]);
+    let command = train("--out run --learning-rate 0.01 --margin 0.5 --validation-share 0.3");
     let first = succeeds(folder, &command);
     assert!(
         first.contains("R@1") && first.contains("run/head.safetensors"),
@@ -55,16 +38,7 @@ fn a_head_is_trained_continued_and_given_to_a_map() {
     let head = || Head::load(&folder.join("run/head.safetensors")).unwrap();
     let before = head();
     assert_eq!((succeeds(folder, &command), head()), (first, before));
-    let other = train(&[
-        "--out",
-        "run",
-        "--learning-rate",
-        "0.01",
-        "--margin",
-        "0.5",
-        "--validation-share",
-        "0.6",
-    ]);
+    let other = train("--out run --learning-rate 0.01 --margin 0.5 --validation-share 0.6");
     assert!(refusal(folder, &other).contains("other data"));
     give_to_a_map(folder);
 }
@@ -85,15 +59,10 @@ fn give_to_a_map(folder: &Path) {
         .with_weights(scaled.clone(), bias.to_vec(), trained.notes().clone())
         .unwrap();
     new.save(&folder.join("new.safetensors")).unwrap();
-    let import = [
-        "import",
-        "town/database",
-        "--map",
-        "town",
-        "--data",
-        "store",
-    ];
-    succeeds(folder, &import);
+    succeeds(
+        folder,
+        &words("import town/database --map town --data store"),
+    );
     let model = |name: &str| {
         let store = SqliteStore::open(&folder.join("store"), &StoreConfig::default()).unwrap();
         let mut globals = Vec::new();
@@ -128,28 +97,14 @@ fn give_to_a_map(folder: &Path) {
     assert_eq!(after, new.rebind(&before).unwrap());
     assert!(succeeds(folder, &rehead("new.safetensors")).contains("already"));
     // What extraction with the new head gives, but for the half precision of what the store kept.
-    let mut fresh = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    fresh
-        .args([
-            "import",
-            "town/database",
-            "--map",
-            "fresh",
-            "--data",
-            "store",
-        ])
-        .current_dir(folder);
-    fresh
-        .env("PLACEFORMER_EXTRACT__INPUT_SIZE", SERVED_SIZE)
-        .env("PLACEFORMER_EXTRACT__HEAD", "new.safetensors");
-    assert!(
-        fresh
-            .env_remove("PLACEFORMER_CONFIG")
-            .output()
-            .unwrap()
-            .status
-            .success()
-    );
+    let fresh = command(
+        folder,
+        &words("import town/database --map fresh --data store"),
+    )
+    .env("PLACEFORMER_EXTRACT__HEAD", "new.safetensors")
+    .output()
+    .unwrap();
+    assert!(fresh.status.success());
     let (model_of_fresh, expected) = model("fresh");
     assert_eq!(model_of_fresh, after);
     // Four photos are imported at once, so the two maps differ in order.
@@ -180,20 +135,20 @@ fn the_last_block_is_trained_on_varied_images_of_drives() {
         return;
     }
     let folder = town("8", "1");
-    let text = "train --trainable last-1 --drives town/database town/queries --positive-frames 1 --negative-frames 2 \
-                --validation-share 0.4 --steps 1 --mine-every 1 --warm-up 0 --batch 2 --out blocks --input-size";
-    let mut arguments: Vec<&str> = text.split_whitespace().collect();
+    let mut arguments = words(
+        "train --trainable last-1 --drives town/database town/queries --positive-frames 1 \
+         --negative-frames 2 --validation-share 0.4 --steps 1 --mine-every 1 --warm-up 0 --batch 2 \
+         --out blocks --input-size",
+    );
     arguments.push(SIZE);
     let said = succeeds(folder.path(), &arguments);
-    let (weights, head) = (
-        folder.path().join("blocks/weights.safetensors"),
-        folder.path().join("blocks/head.safetensors"),
-    );
+    let weights = folder.path().join("blocks/weights.safetensors");
+    let head = folder.path().join("blocks/head.safetensors");
     assert!(
         said.contains("blocks/weights.safetensors") && weights.exists(),
         "{said}"
     );
-    // Bound to the weights beside it, whichever were kept.
+    // The head is bound to the weights that were written with it.
     let weights = VitWeights::load(&weights, Preset::Dinov2Vits14, None).unwrap();
     let bound = format!("dinov2-vits14:{}:b8", &weights.content_hash()[..12]);
     assert_eq!(Head::load(&head).unwrap().backbone(), bound);
@@ -205,106 +160,41 @@ fn what_cannot_be_trained_is_refused_before_the_model_is_loaded() {
     let folder = folder.path();
     std::fs::create_dir(folder.join("empty")).unwrap();
     for (arguments, part) in [
-        (&["train", "--out", "x"][..], "--dataset"),
-        (&["train", "--out", "x", "--dataset", "csv"], "--root"),
+        ("train --out x", "--dataset"),
+        ("train --out x --dataset csv", "--root"),
         (
-            &[
-                "train",
-                "--out",
-                "x",
-                "--drives",
-                "town/database",
-                "--trainable",
-                "last-0",
-            ],
+            "train --out x --drives town/database --trainable last-0",
             "last-N",
         ),
         (
-            &[
-                "train",
-                "--out",
-                "x",
-                "--drives",
-                "town/database",
-                "--viewpoint",
-                "0.1",
-            ],
+            "train --out x --drives town/database --viewpoint 0.1",
             "cached tokens",
         ),
         (
-            &[
-                "train",
-                "--out",
-                "x",
-                "--drives",
-                "town/database",
-                "--warm-up",
-                "9000",
-            ],
+            "train --out x --drives town/database --warm-up 9000",
             "warm-up",
         ),
+        ("train --out x --drives empty", "holds no JPEG"),
         (
-            &["train", "--out", "x", "--drives", "empty"],
-            "holds no JPEG",
-        ),
-        (
-            &[
-                "train",
-                "--out",
-                "x",
-                "--drives",
-                "town/database",
-                "--validation-share",
-                "2",
-            ],
+            "train --out x --drives town/database --validation-share 2",
             "between 0 and 1",
         ),
         (
-            &["train", "--out", "x", "--drives", "town/database"],
+            "train --out x --drives town/database",
             "nothing to learn from",
         ),
         (
-            &[
-                "head",
-                "train",
-                "--out",
-                "x",
-                "--dataset",
-                "csv",
-                "--root",
-                "town",
-                "--positive-m",
-                "30",
-            ],
+            "head train --out x --dataset csv --root town --positive-m 30",
             "no order",
         ),
+        ("head fit --images empty --out x", "no images"),
         (
-            &["head", "fit", "--images", "empty", "--out", "x"],
-            "no images",
-        ),
-        (
-            &[
-                "head",
-                "fit",
-                "--images",
-                "town",
-                "--out",
-                "x",
-                "--aggregate",
-                "gem",
-                "--gem-p",
-                "0.5",
-            ],
+            "head fit --images town --out x --aggregate gem --gem-p 0.5",
             "from 1 to 64",
         ),
-        (
-            &[
-                "map", "rehead", "town", "--head", "absent", "--data", "town",
-            ],
-            "absent",
-        ),
+        ("map rehead town --head absent --data town", "absent"),
     ] {
-        let error = refusal(folder, arguments);
-        assert!(error.contains(part), "{arguments:?}: {error}");
+        let error = refusal(folder, &words(arguments));
+        assert!(error.contains(part), "{arguments}: {error}");
     }
 }

@@ -1,84 +1,40 @@
 //! What `eval`, `import` and `match` say to wrong arguments, before any model is loaded; and `eval`
 //! from photos to figures, files and pages, on a small drawn town.
 
-#[path = "common/town.rs"]
-mod town;
-
+use crate::common::program::{
+    self, SIZE, has_model, offline, prints, refused_by, succeeds, town, words,
+};
 use placeformer_core::types::Calibration;
 use serde_json::Value;
 use std::path::Path;
-use std::process::{Command, Output};
-use town::{SIZE, has_model, prints, succeeds, town};
 
-fn placeformer(arguments: &[&str], folder: &Path) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    // An empty cache and no network address: whatever gets as far as the model fails for that
-    // reason instead.
-    command
-        .args(arguments)
-        .env("PLACEFORMER_CACHE", folder.join("cache"))
-        .env("HF_ENDPOINT", "http://127.0.0.1:9");
-    command
-        .env_remove("PLACEFORMER_WEIGHTS")
-        .env_remove("PLACEFORMER_CONFIG")
-        .env("PATH", "");
-    command.output().expect("the binary was built")
-}
-
+/// What the program says to arguments that it refuses before it needs a model.
+#[track_caller]
 fn refusal(arguments: &[&str], folder: &Path) -> String {
-    let output = placeformer(arguments, folder);
-    assert!(!output.status.success(), "{arguments:?} succeeded");
-    String::from_utf8_lossy(&output.stderr).into_owned()
+    refused_by(&mut offline(folder, arguments))
 }
 
 #[test]
 fn eval_needs_one_whole_description_of_the_data() {
     let folder = tempfile::tempdir().unwrap();
     for (arguments, part) in [
-        (&["eval"][..], "--dataset"),
-        (&["eval", "--dataset", "pitts30k"], "--root"),
+        ("eval", "--dataset"),
+        ("eval --dataset pitts30k", "--root"),
+        ("eval --database a --queries b", "--ground-truth"),
+        ("eval --dataset pitts300k --root x", "pitts30k"),
+        ("eval --dataset utm --root /nowhere", "@utm_east@utm_north@"),
+        ("eval --dataset utm --root /nowhere --radius=-1", "radius"),
         (
-            &["eval", "--database", "a", "--queries", "b"],
-            "--ground-truth",
-        ),
-        (
-            &["eval", "--dataset", "pitts300k", "--root", "x"],
-            "pitts30k",
-        ),
-        (
-            &["eval", "--dataset", "utm", "--root", "/nowhere"],
-            "@utm_east@utm_north@",
-        ),
-        (
-            &[
-                "eval",
-                "--dataset",
-                "utm",
-                "--root",
-                "/nowhere",
-                "--radius=-1",
-            ],
-            "radius",
-        ),
-        (
-            &["eval", "--dataset", "msls-val", "--root", "/nowhere"],
+            "eval --dataset msls-val --root /nowhere",
             "train_val/<city>",
         ),
         (
-            &[
-                "eval",
-                "--dataset",
-                "utm",
-                "--root",
-                "/nowhere",
-                "--scales",
-                "4",
-            ],
+            "eval --dataset utm --root /nowhere --scales 4",
             "not a scale",
         ),
     ] {
-        let error = refusal(arguments, folder.path());
-        assert!(error.contains(part), "{arguments:?}: {error}");
+        let error = refusal(&words(arguments), folder.path());
+        assert!(error.contains(part), "{arguments}: {error}");
     }
 }
 
@@ -86,91 +42,41 @@ fn eval_needs_one_whole_description_of_the_data() {
 fn eval_calibrate_takes_the_same_data_and_its_own_options() {
     let folder = tempfile::tempdir().unwrap();
     for (arguments, part) in [
-        (&["eval", "calibrate"][..], "--dataset"),
-        (&["eval", "calibrate", "--dataset", "pitts30k"], "--root"),
+        ("eval calibrate", "--dataset"),
+        ("eval calibrate --dataset pitts30k", "--root"),
         (
-            &[
-                "eval",
-                "calibrate",
-                "--dataset",
-                "utm",
-                "--root",
-                "/nowhere",
-            ],
+            "eval calibrate --dataset utm --root /nowhere",
             "@utm_east@utm_north@",
         ),
         (
-            &[
-                "eval",
-                "calibrate",
-                "--dataset",
-                "utm",
-                "--root",
-                "/nowhere",
-                "--target-precision",
-                "1.5",
-            ],
+            "eval calibrate --dataset utm --root /nowhere --target-precision 1.5",
             "0.99",
         ),
         (
-            &[
-                "eval",
-                "calibrate",
-                "--dataset",
-                "utm",
-                "--root",
-                "/nowhere",
-                "--candidates",
-                "0",
-            ],
+            "eval calibrate --dataset utm --root /nowhere --candidates 0",
             "--candidates",
         ),
         (
-            &[
-                "eval",
-                "calibrate",
-                "--dataset",
-                "utm",
-                "--root",
-                "/nowhere",
-                "--leave-out",
-                "no",
-            ],
+            "eval calibrate --dataset utm --root /nowhere --leave-out no",
             "never",
         ),
         (
-            &[
-                "eval",
-                "calibrate",
-                "--dataset",
-                "utm",
-                "--root",
-                "/nowhere",
-                "--no-rerank",
-            ],
+            "eval calibrate --dataset utm --root /nowhere --no-rerank",
             "--no-rerank",
         ),
-        (
-            &[
-                "eval",
-                "--dataset",
-                "utm",
-                "--root",
-                "/nowhere",
-                "calibrate",
-            ],
-            "calibrate",
-        ),
+        ("eval --dataset utm --root /nowhere calibrate", "calibrate"),
     ] {
-        let error = refusal(arguments, folder.path());
-        assert!(error.contains(part), "{arguments:?}: {error}");
+        let error = refusal(&words(arguments), folder.path());
+        assert!(error.contains(part), "{arguments}: {error}");
     }
 }
 
 #[test]
 fn eval_calibrate_says_where_unknown_places_come_from() {
     let folder = tempfile::tempdir().unwrap();
-    let output = placeformer(&["eval", "calibrate", "--help"], folder.path());
+    let output = offline(folder.path(), &["eval", "calibrate", "--help"])
+        .output()
+        .unwrap();
     let help = String::from_utf8_lossy(&output.stdout);
     let flowing = help.split_whitespace().collect::<Vec<_>>().join(" ");
     assert!(
@@ -202,27 +108,13 @@ fn import_needs_a_target_photos_and_a_reachable_server() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path().to_str().unwrap();
     assert!(refusal(&["import", root, "--map", "m"], folder.path()).contains("--server"));
-    let nowhere = [
-        "import",
-        root,
-        "--map",
-        "m",
-        "--server",
-        "http://127.0.0.1:9",
-        "--attempts",
-        "1",
-    ];
+    let mut nowhere = words("import --map m --server http://127.0.0.1:9 --attempts 1");
+    nowhere.push(root);
     assert!(refusal(&nowhere, folder.path()).contains("holds no JPEG"));
     std::fs::write(folder.path().join("a.jpg"), b"x").unwrap();
     assert!(refusal(&nowhere, folder.path()).contains("127.0.0.1:9"));
-    let bad_map = [
-        "import",
-        root,
-        "--map",
-        "a b",
-        "--server",
-        "http://127.0.0.1:9",
-    ];
+    let mut bad_map = words("import --server http://127.0.0.1:9 --map");
+    bad_map.extend(["a b", root]);
     assert!(refusal(&bad_map, folder.path()).contains("1 to 64"));
 }
 
@@ -238,21 +130,10 @@ fn match_refuses_a_picture_it_cannot_write_before_loading_the_model() {
 
 /// `eval` on the town, with everything kept below `folder`.
 fn eval<'a>(more: &[&'a str]) -> Vec<&'a str> {
-    [
-        &[
-            "eval",
-            "--dataset",
-            "csv",
-            "--root",
-            "town",
-            "--input-size",
-            SIZE,
-            "--cache",
-            "cache",
-        ],
-        more,
-    ]
-    .concat()
+    let mut arguments = words("eval --dataset csv --root town --cache cache --input-size");
+    arguments.push(SIZE);
+    arguments.extend(more);
+    arguments
 }
 
 fn keys(value: &Value) -> Vec<&str> {
@@ -370,23 +251,12 @@ fn a_prediction_file_has_a_line_for_every_query() {
         b"torn",
     )
     .unwrap();
-    let arguments = [
-        "eval",
-        "--dataset",
-        "msls-test",
-        "--root",
-        "msls",
-        "--cities",
-        "miami",
-        "--input-size",
-        SIZE,
-        "--cache",
-        "c",
-    ];
-    let (_, said) = prints(
-        folder,
-        &[&arguments[..], &["--predictions", "out.txt"]].concat(),
+    let mut arguments = words(
+        "eval --dataset msls-test --root msls --cities miami --cache c --predictions out.txt \
+         --input-size",
     );
+    arguments.push(SIZE);
+    let (_, said) = prints(folder, &arguments);
     assert!(
         said.contains("1 of the queries could not be answered"),
         "{said}"
@@ -422,42 +292,20 @@ fn a_calibration_is_fitted_and_judged_elsewhere() {
     }
     let town = town("8", "2");
     let folder = town.path();
-    let calibrate = [
-        "eval",
-        "calibrate",
-        "--dataset",
-        "csv",
-        "--root",
-        "town",
-        "--input-size",
-        SIZE,
-    ];
-    let fit = [
-        "--cache",
-        "cache",
-        "--leave-out",
-        "always",
-        "--target-precision",
-        "0.8",
-        "--out",
-        "own.json",
-    ];
-    let text = succeeds(folder, &[&calibrate[..], &fit].concat());
+    let mut calibrate = words(
+        "eval calibrate --dataset csv --root town --cache cache --leave-out always \
+         --target-precision 0.8 --out own.json --input-size",
+    );
+    calibrate.push(SIZE);
+    let text = succeeds(folder, &calibrate);
     assert!(text.contains("re-ranked"), "{text}");
     let bytes = std::fs::read(folder.join("own.json")).unwrap();
     let calibration: Calibration = serde_json::from_slice(&bytes).unwrap();
     assert!(calibration.curve(true).right > 0 && calibration.curve(true).wrong > 0);
     // The same answers judge it: as many again cannot be right.
-    let more = [
-        "--leave-out",
-        "--calibration",
-        "own.json",
-        "--json",
-        "out.json",
-        "--html",
-        "out.html",
-    ];
-    let text = succeeds(folder, &eval(&[&more[..], &["--pictures", "0"]].concat()));
+    let more =
+        words("--leave-out --calibration own.json --json out.json --html out.html --pictures 0");
+    let text = succeeds(folder, &eval(&more));
     assert!(text.contains("of the calibration given"), "{text}");
     let json: Value =
         serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
@@ -472,7 +320,7 @@ fn a_calibration_is_fitted_and_judged_elsewhere() {
     let page = std::fs::read_to_string(folder.join("out.html")).unwrap();
     assert!(page.contains("the one given, error"));
     // It holds for this re-ranking only.
-    let error = town::refusal(
+    let error = program::refusal(
         folder,
         &eval(&["--calibration", "own.json", "--scales", "1"]),
     );

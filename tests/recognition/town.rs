@@ -1,70 +1,12 @@
 //! From photos to places with the real model: a town is imported into a server and recognised
 //! again.
 
-#[path = "common/town.rs"]
-mod town;
-
+use crate::common::program::{Server, command, has_model, succeeds};
 use serde_json::Value;
-use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Child, Stdio};
-use std::time::{Duration, Instant};
-use town::{command, has_model, placeformer, succeeds};
 
-/// Half the default: the smallest at which streets are told apart.
+/// Half the default: the smallest size at which streets are told apart.
 const RECOGNISABLE_SIZE: &str = "{width=224,height=168}";
-
-/// `serve` in a process of its own, killed when dropped.
-struct Server {
-    child: Child,
-    url: String,
-}
-
-impl Server {
-    #[track_caller]
-    fn start(folder: &Path) -> Self {
-        let mut serve = command(
-            folder,
-            &["serve", "--listen", "127.0.0.1:0", "--data", "store"],
-        );
-        serve.env("PLACEFORMER_EXTRACT__INPUT_SIZE", RECOGNISABLE_SIZE);
-        let mut child = serve
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
-        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        let url =
-            lines.find_map(|line| Some(line.unwrap().strip_prefix("listening on ")?.to_owned()));
-        let server = Self {
-            child,
-            url: url.expect("the server did not start"),
-        };
-        let began = Instant::now();
-        while !server.is_ready(folder) {
-            assert!(
-                began.elapsed() < Duration::from_secs(120),
-                "the server never became ready"
-            );
-            std::thread::sleep(Duration::from_millis(100));
-        }
-        server
-    }
-
-    fn is_ready(&self, folder: &Path) -> bool {
-        placeformer(folder, &["healthcheck", "--server", &self.url])
-            .status
-            .success()
-    }
-}
-
-impl Drop for Server {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
 
 /// Query and reference, one pair a row; the reference is empty where the place is not mapped.
 fn pairs(folder: &Path) -> Vec<(String, String)> {
@@ -87,7 +29,11 @@ fn a_town_is_imported_and_recognised() {
         "320x240",
     ];
     succeeds(folder, &drawn);
-    let server = Server::start(folder);
+    let arguments = ["serve", "--listen", "127.0.0.1:0", "--data", "store"];
+    let mut serve = command(folder, &arguments);
+    serve.env("PLACEFORMER_EXTRACT__INPUT_SIZE", RECOGNISABLE_SIZE);
+    let server = Server::start(serve);
+    succeeds(folder, &["healthcheck", "--server", &server.url]);
     let target = ["--map", "town", "--server", &server.url];
     succeeds(
         folder,

@@ -1,10 +1,8 @@
 //! The index is a cache of the store: after any history, a service rebuilt from the store answers
 //! as the live one does, and both as a plain model of what was asked of them says.
 
-#[path = "common/places.rs"]
-mod places;
-mod support;
-
+use crate::common::places::{map, named_reference, reference, unit_vector};
+use crate::support::{self, FakeSource, picture};
 use bytes::Bytes;
 use placeformer::config::Config;
 use placeformer::pipeline::{IngestRequest, QueryOptions, QueryRequest, Service};
@@ -17,12 +15,10 @@ use placeformer_store::{
     Inserted, ReadPlaces, ReferencePatch, SqliteStore, StoreConfig, WritePlaces,
 };
 use placeformer_vision::search::{IndexBuilder, IndexEntry, MapIndex};
-use places::{map, named_reference, reference, unit_vector};
 use proptest::prelude::*;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use support::{FakeSource, picture};
 use time::OffsetDateTime;
 
 // ---------------------------------------------------------------- any history
@@ -54,7 +50,13 @@ fn operation() -> impl Strategy<Value = Operation> {
     let small = || prop::option::of(0u8..10);
     prop_oneof![
         12 => (0..MAPS, 0u64..6, prop::option::of(0u8..4), small(), small())
-            .prop_map(|(map, photo, name, place, minute)| Operation::Ingest { map, photo, name, place, minute }),
+            .prop_map(|(map, photo, name, place, minute)| Operation::Ingest {
+                map,
+                photo,
+                name,
+                place,
+                minute,
+            }),
         5 => (any::<prop::sample::Index>(), prop::option::of(small()), prop::option::of(small()))
             .prop_map(|(which, place, minute)| Operation::Patch { which, place, minute }),
         4 => any::<prop::sample::Index>().prop_map(Operation::Delete),
@@ -125,14 +127,13 @@ impl History {
         let directory = tempfile::tempdir().unwrap();
         let service = Some(start(directory.path()));
         let runtime = tokio::runtime::Runtime::new().unwrap();
-        let (model, gone, maps) = (Model::default(), Vec::new(), Default::default());
         Self {
             directory,
             runtime,
             service,
-            model,
-            gone,
-            maps,
+            model: Model::default(),
+            gone: Vec::new(),
+            maps: Default::default(),
         }
     }
 
@@ -319,7 +320,8 @@ impl History {
 
 /// A listing, three at a time.
 async fn listed(service: &Arc<Service>, map: Option<MapName>) -> Vec<Reference> {
-    let (mut all, mut after) = (Vec::new(), None);
+    let mut all = Vec::new();
+    let mut after = None;
     loop {
         let page = service.references(map.clone(), after, 3).await.unwrap();
         assert!(page.references.len() == 3 || page.next.is_none());
@@ -347,9 +349,15 @@ fn filters() -> [ReferenceFilter; 3] {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 16, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig {
+        cases: 16,
+        failure_persistence: None,
+        ..ProptestConfig::default()
+    })]
     #[test]
-    fn rebuilt_equals_live_after_any_history(operations in prop::collection::vec(operation(), 0..40)) {
+    fn rebuilt_equals_live_after_any_history(
+        operations in prop::collection::vec(operation(), 0..40),
+    ) {
         let mut history = History::new();
         operations.into_iter().for_each(|operation| history.run(operation));
         let live = history.check();

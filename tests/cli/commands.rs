@@ -1,12 +1,9 @@
 //! `load`, `verify` and `bench` as commands: the real binary, its report, and how it fails.
 
-#[path = "common/places.rs"]
-mod places;
-mod support;
-
+use crate::common::{places, service as support};
 use placeformer::http::serve;
 use placeformer_core::types::ReferenceId;
-use placeformer_store::{Inserted, PlaceStore, SqliteStore, StoreConfig};
+use placeformer_store::{Inserted, SqliteStore, StoreConfig, WritePlaces};
 use places::{map, named_reference};
 use serde_json::Value;
 use std::future::pending;

@@ -1,7 +1,7 @@
 //! A whole service without weights: a real store in a temporary directory, the real surface, and a
 //! descriptor source that derives everything from the image's content.
-#![allow(dead_code, reason = "each test file uses its own part")]
 
+use super::noise;
 use axum::body::Body;
 use axum::http::{HeaderMap, Request, StatusCode};
 use axum::response::Response;
@@ -18,7 +18,7 @@ use placeformer_store::{PlaceStore, SqliteStore, StoreConfig};
 use placeformer_vision::extract::pack;
 use placeformer_vision::extract::{Aggregate, ExtractError, Head};
 use placeformer_vision::image::{ImageConfig, ImageError, load_tensor};
-use rand::{RngExt, SeedableRng};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 use std::path::Path;
@@ -130,7 +130,8 @@ pub const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Waits until `condition` holds.
 pub fn until(what: &str, condition: impl Fn() -> bool) -> impl Future<Output = ()> {
-    let (what, began) = (what.to_owned(), std::time::Instant::now());
+    let what = what.to_owned();
+    let began = std::time::Instant::now();
     async move {
         while !condition() {
             assert!(began.elapsed() < PATIENCE, "{what} never came about");
@@ -144,7 +145,7 @@ impl FakeSource {
         Self::made(ModelId::new(model), None)
     }
 
-    /// One whose global descriptors are its pooled tokens behind `head`.
+    /// A source whose global descriptors are its pooled tokens, projected by `head`.
     pub fn with_head(head: Head) -> Arc<Self> {
         let headless = ModelId::new(format!("{BACKBONE}:{SIZE}:t1:k48-12-4:hnone"));
         Self::made(head.rebind(&headless).unwrap(), Some(head))
@@ -219,15 +220,13 @@ impl DescriptorSource for FakeSource {
     }
 }
 
-/// Whose tokens the fake ones pretend to be.
+/// The backbone that the fake tokens pretend to come from.
 pub const BACKBONE: &str = "fake:0123456789ab:b8";
 
 /// A head for `backbone`, drawn from `seed`.
 pub fn head(seed: u64, backbone: &str, aggregate: Aggregate) -> Head {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let weight = (0..GLOBAL_DIM * 384)
-        .map(|_| rng.random_range(-1.0..1.0))
-        .collect();
+    let weight = noise::values(&mut rng, GLOBAL_DIM * 384, 1.0);
     Head::new(
         aggregate,
         weight,
@@ -253,7 +252,7 @@ fn describe(image: &ImageTensor) -> Descriptor {
         .collect();
     let mut rng = ChaCha8Rng::seed_from_u64(u64::from(crc32fast::hash(&bytes)));
     let mut unit = |dim: usize| {
-        let raw: Vec<f32> = (0..dim).map(|_| rng.random_range(-1.0..1.0)).collect();
+        let raw = noise::values(&mut rng, dim, 1.0);
         let norm = raw.iter().map(|v| v * v).sum::<f32>().sqrt();
         raw.into_iter().map(|v| v / norm).collect::<Vec<f32>>()
     };
@@ -433,10 +432,8 @@ fn start(
     source: Arc<dyn DescriptorSource>,
     config: Config,
 ) -> (AppState, Arc<Service>) {
-    let (metrics, health) = (
-        Arc::new(Metrics::new().unwrap()),
-        Arc::new(Health::default()),
-    );
+    let metrics = Arc::new(Metrics::new().unwrap());
+    let health = Arc::new(Health::default());
     let limit = config.image.max_bytes;
     let state = AppState::new(
         config.http.clone(),
@@ -531,15 +528,7 @@ impl Answer {
 
 /// A PNG that no other seed gives.
 pub fn picture(seed: u64) -> Vec<u8> {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let pixels = image::RgbImage::from_fn(SIZE.width / 4, SIZE.height / 4, |_, _| {
-        image::Rgb(rng.random())
-    });
-    let mut bytes = std::io::Cursor::new(Vec::new());
-    pixels
-        .write_to(&mut bytes, image::ImageFormat::Png)
-        .unwrap();
-    bytes.into_inner()
+    noise::png(seed, SIZE.width / 4, SIZE.height / 4)
 }
 
 /// A multipart body of named parts, with its content type.

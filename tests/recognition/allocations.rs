@@ -1,31 +1,52 @@
 //! In the steady state, the stages of a query allocate their answers and little else: buffers are
 //! kept, matrices of similarities and scores never exist.
 
+use crate::common::weights::made_up;
 use placeformer_core::types::{ImageSize, ImageTensor, ReferenceFilter};
 use placeformer_kernels::Simd;
 use placeformer_lab::bench::scenes::{CANDIDATES, RerankScene, index_entry, unit_vector};
 use placeformer_vision::extract::pack;
 use placeformer_vision::extract::{
-    BlockWeights, Encoder, EncoderSpec, FusedEncoder, Geometry, Linear, Norm, Precision, Preset,
-    VitWeights,
+    Encoder, EncoderSpec, FusedEncoder, Geometry, Precision, Preset,
 };
 use placeformer_vision::rerank::{RerankConfig, Reranker};
 use placeformer_vision::search::MapIndex;
 use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
 use std::alloc::System;
-use std::sync::Mutex;
+use std::process::Command;
 
 #[global_allocator]
 static ALLOCATOR: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
 
-/// What the tests of this file allocate is counted together.
-static ALONE: Mutex<()> = Mutex::new(());
+/// Set in a process that runs one test of this file and no other.
+const ALONE: &str = "PLACEFORMER_TEST_ALONE";
+
+/// Runs `work` in a process of its own: the allocator counts what every thread of the process
+/// allocates, so tests that run at the same time would be counted, too. `test` names the test that
+/// calls this; the new process is this test binary, started on that test alone.
+fn in_a_process_of_its_own(test: &str, work: impl FnOnce()) {
+    if std::env::var_os(ALONE).is_some() {
+        return work();
+    }
+    let child = Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", &format!("allocations::{test}"), "--nocapture"])
+        .env(ALONE, "1")
+        .output()
+        .unwrap();
+    let printed = String::from_utf8_lossy(&child.stdout);
+    // A misspelt name would run no test and succeed.
+    let passed = child.status.success() && printed.contains("1 passed");
+    assert!(
+        passed,
+        "{printed}{}",
+        String::from_utf8_lossy(&child.stderr)
+    );
+}
 
 /// The fewest bytes that one of several runs of `work` allocates: the first ones fill buffers and
 /// start threads, and a later one may be the first in which all threads need a buffer at the same
 /// moment.
 fn steady_bytes<T>(mut work: impl FnMut() -> T) -> usize {
-    let _alone = ALONE.lock().unwrap();
     let mut run = || {
         let region = Region::new(ALLOCATOR);
         let result = work();
@@ -36,47 +57,12 @@ fn steady_bytes<T>(mut work: impl FnMut() -> T) -> usize {
     (0..10).map(|_| run()).min().unwrap()
 }
 
-fn linear(outputs: usize, inputs: usize) -> Linear {
-    let weight = (0..outputs * inputs)
-        .map(|i| ((i * 37) % 101) as f32 / 1000.0 - 0.05)
-        .collect();
-    Linear {
-        weight,
-        bias: vec![0.01; outputs],
-    }
-}
-
-fn weights(geometry: Geometry) -> VitWeights {
-    let Geometry { dim, mlp_dim, .. } = geometry;
-    let norm = || Norm {
-        weight: vec![1.0; dim],
-        bias: vec![0.0; dim],
-    };
-    let block = || BlockWeights {
-        norm1: norm(),
-        qkv: linear(3 * dim, dim),
-        proj: linear(dim, dim),
-        layer_scale1: None,
-        norm2: norm(),
-        fc1: linear(mlp_dim, dim),
-        fc2: linear(dim, mlp_dim),
-        layer_scale2: None,
-    };
-    VitWeights {
-        preset: Preset::Dinov2Vits14,
-        unused_parameters: 0,
-        geometry,
-        position_grid: (5, 5),
-        blocks: (0..geometry.depth).map(|_| block()).collect(),
-        patch_embed: linear(dim, 3 * geometry.patch * geometry.patch),
-        cls_token: vec![0.1; dim],
-        positions: vec![0.1; 26 * dim],
-        norm: norm(),
-    }
-}
-
 #[test]
 fn extraction_allocates_its_answer() {
+    in_a_process_of_its_own("extraction_allocates_its_answer", check_extraction);
+}
+
+fn check_extraction() {
     let geometry = Geometry {
         depth: 3,
         dim: 128,
@@ -99,14 +85,14 @@ fn extraction_allocates_its_answer() {
         size: input_size,
         data: vec![0.3; 3 * 280 * 210],
     };
+    let weights = made_up(Preset::Dinov2Vits14, geometry, (5, 5), 1);
     for precision in [
         Precision::F32,
         Precision::Bf16,
         Precision::Mixed,
         Precision::Int8,
     ] {
-        let Ok(encoder) = FusedEncoder::new(&weights(geometry), spec, Simd::best(), precision)
-        else {
+        let Ok(encoder) = FusedEncoder::new(&weights, spec, Simd::best(), precision) else {
             println!("{precision} is not to be had on this CPU");
             assert_ne!(precision, Precision::F32);
             continue;
@@ -127,6 +113,10 @@ fn extraction_allocates_its_answer() {
 
 #[test]
 fn reranking_allocates_no_matrices() {
+    in_a_process_of_its_own("reranking_allocates_no_matrices", check_reranking);
+}
+
+fn check_reranking() {
     let scene = RerankScene::new(0.4);
     let query = pack(&scene.query);
     let candidates: Vec<_> = scene.candidates.iter().map(pack).collect();
@@ -149,6 +139,13 @@ fn reranking_allocates_no_matrices() {
 
 #[test]
 fn searching_allocates_in_proportion_to_what_it_finds() {
+    in_a_process_of_its_own(
+        "searching_allocates_in_proportion_to_what_it_finds",
+        check_search,
+    );
+}
+
+fn check_search() {
     let index = MapIndex::build((0..50_000).map(index_entry).collect());
     let query = unit_vector(1 << 40);
     let bytes = steady_bytes(|| index.search(&query, 100, &ReferenceFilter::default()));

@@ -1,0 +1,9 @@
+//! The program's commands from arguments to files and answers.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod commands;
+mod eval;
+mod own_weights;
+mod train;
