@@ -7,17 +7,17 @@ mod table;
 
 use super::model_args::ModelOptions;
 use crate::cli::output::say;
+use crate::cli::progress::ProgressBars;
 use anyhow::{Context, ensure};
 use end_to_end::{EndToEnd, EndToEndRow};
-use indicatif::{ProgressBar, ProgressStyle};
-use placeformer_lab::bench::{Bench, BenchError, Limits, NAMES, Row};
+use placeformer_core::progress::{Progress, Task};
+use placeformer_lab::bench::{Bench, BenchError, BenchRow, Limits, NAMES};
 use placeformer_models::resolve_weights;
 use placeformer_vision::extract::{ExtractError, Extractor, VitWeights};
 use serde::Serialize;
 use service::PipelineServices;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
@@ -71,7 +71,7 @@ struct Report {
     threads: usize,
     encoder: String,
     limits: Limits,
-    rows: Vec<Row>,
+    rows: Vec<BenchRow>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     end_to_end: Vec<EndToEndRow>,
 }
@@ -131,14 +131,15 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
         std::fs::write(path, serde_json::to_vec_pretty(&report)?)
             .with_context(|| format!("cannot write {}", path.display()))?;
     }
-    match args.end_to_end {
-        true => say!("{}", table::end_to_end(&report.end_to_end))?,
-        false => say!("{}", table::rows(&report.rows))?,
+    if args.end_to_end {
+        say!("{}", table::end_to_end(&report.end_to_end))?;
+    } else {
+        say!("{}", table::rows(&report.rows))?;
     }
     Ok(())
 }
 
-fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<Row>> {
+fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<BenchRow>> {
     for name in only {
         ensure!(
             NAMES.contains(&name.as_str()),
@@ -146,29 +147,26 @@ fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<Row>> {
             NAMES.join(", ")
         );
     }
-    let wanted = |name: &&str| {
-        only.iter().any(|wanted| wanted == name) || only.is_empty() && *name != "search_10m"
+    let wanted = |name: &&str| match only {
+        [] => *name != "search_10m",
+        only => only.iter().any(|wanted| wanted == name),
     };
     let names: Vec<&str> = NAMES.into_iter().filter(wanted).collect();
-    let bar = ProgressBar::new(names.len() as u64).with_style(ProgressStyle::with_template(
-        "{msg} [{bar:40}] {pos}/{len} {elapsed}",
-    )?);
-    bar.enable_steady_tick(Duration::from_millis(500));
+    let bars = ProgressBars::default();
+    let task = Task::begin(&bars, "measuring", names.len() as u64);
     let mut rows = Vec::new();
     for name in names {
-        bar.set_message(name.to_owned());
+        task.set_note(name);
         match bench.row(name) {
             Ok(row) => rows.push(row),
             // Named rows must be measured; of all rows, those this CPU can.
             Err(BenchError::Extract(error @ ExtractError::Precision { .. })) if only.is_empty() => {
-                // The bar's own `println` says nothing where there is no terminal.
-                bar.suspend(|| eprintln!("left out {name}: {error}"));
+                bars.suspend(&mut || eprintln!("left out {name}: {error}"));
             }
             Err(error) => return Err(error.into()),
         }
-        bar.inc(1);
+        task.add(1);
     }
-    bar.finish_and_clear();
     Ok(rows)
 }
 

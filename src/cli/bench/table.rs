@@ -2,7 +2,7 @@
 
 use super::peers::Measured;
 use super::{EndToEndRow, Report};
-use placeformer_lab::bench::Row;
+use placeformer_lab::bench::BenchRow;
 use std::fmt::Write;
 
 /// What it ran on.
@@ -23,7 +23,7 @@ pub(super) fn machine(report: &Report) -> String {
 }
 
 /// One line per stage.
-pub(super) fn rows(rows: &[Row]) -> String {
+pub(super) fn rows(rows: &[BenchRow]) -> String {
     let mut text = format!(
         "{:<20} {:>10} {:>12} {:>7} {:>9}  baseline\n",
         "stage", "ours ms", "baseline ms", "ratio", "of limit"

@@ -3,7 +3,7 @@
 //! Points are hashed into square cells as wide as the radius, so that all neighbours of a point lie
 //! in the 3x3 cells around it: a million images join in seconds.
 
-use super::{Item, Truth};
+use super::dataset::{Item, Truth};
 use placeformer_core::geography::MetricPoint;
 use std::collections::HashMap;
 

@@ -7,10 +7,13 @@
 //! beside them, only the frames it lists take part: the usual evaluation leaves tunnels and
 //! stations out.
 
-use super::DatasetError;
+use super::dataset::{Dataset, Item, Skipped, Truth};
+use super::error::DatasetError;
+use super::kind::Split;
 use super::layout::require;
+use super::options::DatasetOptions;
 use super::utm::find_split;
-use super::{Dataset, DatasetOptions, Item, Skipped, Split, Truth};
+use crate::choice::Choice;
 use placeformer_core::folder::list_images;
 use placeformer_core::geography::UtmName;
 use std::collections::BTreeSet;

@@ -4,9 +4,10 @@
 //! below the two folders. A query the file does not mention stays [`Truth::Unknown`]: it is
 //! searched but not counted.
 
-use super::DatasetError;
+use super::dataset::{Dataset, Item, Truth};
+use super::error::DatasetError;
+use super::positions;
 use super::table::Table;
-use super::{Dataset, Item, Truth, positions};
 use placeformer_core::folder::list_images;
 use std::collections::HashMap;
 use std::path::Path;

@@ -5,8 +5,8 @@
 //! data set find their rows in one table. Positions become metres in the plane of their UTM zones;
 //! regions far apart become groups, see `zones`.
 
-use super::DatasetError;
-use super::Item;
+use super::dataset::Item;
+use super::error::DatasetError;
 use super::table::{Column, Row, Table};
 use super::zones::Zones;
 use placeformer_core::folder::relative_name;

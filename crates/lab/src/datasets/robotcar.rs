@@ -5,10 +5,13 @@
 //! names query images with a 4x4 camera-to-world matrix each; `robotcar_v2_test.txt` names those
 //! whose poses are withheld. Metadata say `.png` where the images are `.jpg`.
 
-use super::DatasetError;
+use super::dataset::{Dataset, Item, Truth};
+use super::error::DatasetError;
+use super::kind::Split;
 use super::layout::require;
 use super::neighbours::NeighbourGrid;
-use super::{Dataset, DatasetOptions, Item, Split, Truth};
+use super::options::DatasetOptions;
+use super::pose::Pose;
 use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
 use placeformer_core::geography::MetricPoint;
 use std::collections::BTreeSet;
@@ -17,30 +20,6 @@ use std::path::Path;
 const NAME: &str = "robotcar-seasons-v2";
 const EXPECTED: &str =
     "images/<condition>/<camera>, 3D-models/all-merged/all.nvm and robotcar_v2_{train,test}.txt";
-
-/// Where a camera stood and how it was turned.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Pose {
-    /// Rotation from world to camera.
-    pub rotation: UnitQuaternion<f64>,
-    /// Centre of the camera in world coordinates, metres.
-    pub centre: Vector3<f64>,
-}
-
-impl Pose {
-    /// Distance of the centres in metres and angle between the orientations in degrees.
-    pub fn error(&self, other: &Self) -> (f64, f64) {
-        (
-            (self.centre - other.centre).norm(),
-            self.rotation.angle_to(&other.rotation).to_degrees(),
-        )
-    }
-
-    /// Translation of the world-to-camera transform, as the benchmark wants it.
-    pub fn translation(&self) -> Vector3<f64> {
-        -(self.rotation * self.centre)
-    }
-}
 
 /// Reads the references seen by the queries' cameras, and the queries of one split.
 pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, DatasetError> {

@@ -1,7 +1,7 @@
 //! A tiny-skia surface with the few marks these pictures need: images, squares, lines, dots and
 //! score labels.
 
-use super::DrawError;
+use super::error::DrawError;
 use placeformer_core::types::ImageSize;
 use placeformer_vision::image::RgbImage;
 use tiny_skia::{

@@ -1,7 +1,7 @@
 //! Why two images were found to match, or not: everything the picture of a match needs, computed
 //! anew for one pair.
 
-use super::EvalError;
+use super::error::EvalError;
 use crate::draw::{AttentionMap, CombinationLines, MatchSide, match_picture};
 use placeformer_core::types::PackedPatches;
 use placeformer_vision::extract::Extractor;

@@ -8,9 +8,10 @@
 //! as none. An image that cannot be read is listed with its reason and takes no part; it never
 //! vanishes in silence.
 
-use super::EvalError;
+use super::error::EvalError;
+use crate::choice::Choice;
 use crate::datasets::Item;
-use indicatif::ProgressBar;
+use placeformer_core::progress::Task;
 use placeformer_core::types::{
     ContentHash, Descriptor, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches,
 };
@@ -115,13 +116,31 @@ fn probe_picture(input: ImageSize) -> RgbImage {
 }
 
 /// Which vector is searched.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum GlobalKind {
     /// The global descriptor as the head makes it.
     Head,
     /// The mean patch token before the head.
     Mean,
+}
+
+impl Choice for GlobalKind {
+    const ALL: &'static [Self] = &[Self::Head, Self::Mean];
+
+    fn as_str(self) -> &'static str {
+        match self {
+            Self::Head => "head",
+            Self::Mean => "mean",
+        }
+    }
+
+    fn description(self) -> &'static str {
+        match self {
+            Self::Head => "The global descriptor as the head makes it",
+            Self::Mean => "The mean patch token before the head",
+        }
+    }
 }
 
 /// An image that could not be used.
@@ -242,7 +261,7 @@ impl FeatureCache {
         items: &[Item],
         side: &'static str,
         kind: GlobalKind,
-        progress: &ProgressBar,
+        task: &Task<'_>,
     ) -> Result<Features, EvalError> {
         let mut all = Collected::default();
         for chunk in items.chunks(CHUNK) {
@@ -254,7 +273,7 @@ impl FeatureCache {
             for (item, result) in chunk.iter().zip(found) {
                 all.add(item, side, kind, result)?;
             }
-            progress.inc(chunk.len() as u64);
+            task.add(chunk.len() as u64);
         }
         all.finish(items.len())
     }

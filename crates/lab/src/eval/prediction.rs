@@ -1,6 +1,6 @@
 //! Files that the public benchmarks accept, where the answers are withheld.
 
-use super::EvalError;
+use super::error::EvalError;
 use super::run::Answer;
 use crate::datasets::{Dataset, Item};
 use std::io::Write;

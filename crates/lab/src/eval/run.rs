@@ -1,8 +1,8 @@
 //! Search and re-ranking of every query, as the service does them, with the time each stage takes.
 
-use super::EvalError;
+use super::error::EvalError;
 use super::features::Features;
-use indicatif::ProgressBar;
+use placeformer_core::progress::Task;
 use placeformer_core::types::{GLOBAL_DIM, PackedPatches, ReferenceFilter, ReferenceId};
 use placeformer_vision::rerank::{PairScore, RerankConfig, Reranked, Reranker};
 use placeformer_vision::search::{IndexEntry, MapIndex};
@@ -105,7 +105,7 @@ pub fn rerank_all(
     queries: &Features,
     mut answers: Vec<Answer>,
     config: &RerankConfig,
-    progress: &ProgressBar,
+    task: &Task<'_>,
 ) -> Result<(Vec<Answer>, QuerySeconds), EvalError> {
     let reranker = Reranker::new(config.clone());
     let mut seconds = QuerySeconds::default();
@@ -148,7 +148,7 @@ pub fn rerank_all(
                 ));
             }
         }
-        progress.inc(1);
+        task.add(1);
     }
     let count = answers.len().max(1) as f64;
     Ok((

@@ -4,7 +4,7 @@
 //! Works on normalised tensors, so that decoding and resizing are those of inference. Never
 //! mirrors: a mirrored street is another place.
 
-use super::TrainError;
+use super::error::TrainError;
 use placeformer_core::types::ImageTensor;
 use placeformer_vision::image::{DEVIATION, MEAN};
 use rand::{RngExt, SeedableRng};

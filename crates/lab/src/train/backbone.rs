@@ -4,12 +4,13 @@
 //! only and over whole batches; a test holds the two together. Layers that are not trained are
 //! plain tensors, so that no graph is recorded through them.
 
-use super::augment::augment;
+use super::augment::{Augmentation, augment};
 use super::config::TrainConfig;
+use super::error::TrainError;
 use super::loss::normalise_rows;
-use super::trainer::{Sample, Session, TripletModel, run};
+use super::model::{Sample, TripletModel};
+use super::trainer::{Outcome, Session, run};
 use super::triplets::TripletSet;
-use super::{Augmentation, Outcome, TrainError};
 use candle_core::{D, Device, Tensor, Var};
 use placeformer_core::types::{GLOBAL_DIM, ImageTensor};
 use placeformer_vision::extract::{

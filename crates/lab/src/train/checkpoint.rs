@@ -4,9 +4,9 @@
 //! One safetensors file, written beside and renamed over the last one, so that a run killed while
 //! saving keeps the previous checkpoint.
 
-use super::TrainError;
 use super::adam::Adam;
 use super::config::{TrainConfig, ValidationRecall};
+use super::error::TrainError;
 use candle_core::{Device, Tensor};
 use placeformer_core::files::write_atomically;
 use serde::{Deserialize, Serialize};

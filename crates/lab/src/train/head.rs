@@ -1,10 +1,11 @@
 //! Training the head alone: images are encoded once, so that a step costs a matrix product.
 
 use super::config::TrainConfig;
+use super::error::TrainError;
 use super::loss::normalise_rows;
-use super::trainer::{Sample, Session, TripletModel, run};
+use super::model::{Sample, TripletModel};
+use super::trainer::{Outcome, Session, run};
 use super::triplets::{Side, TripletSet};
-use super::{Outcome, TrainError};
 use candle_core::{Device, Tensor, Var};
 
 /// A linear head over cached pooled tokens.

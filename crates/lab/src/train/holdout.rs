@@ -4,7 +4,7 @@
 //! blocks of ground are held out, or the last part of a drive, and what lies between the two sides
 //! is given to neither.
 
-use super::TrainError;
+use super::error::TrainError;
 use crate::datasets::{Dataset, Item, NeighbourGrid, Truth};
 use placeformer_core::geography::MetricPoint;
 use rand::SeedableRng;

@@ -1,7 +1,7 @@
 //! The diary of a run: one JSON line a cycle.
 
-use super::TrainError;
 use super::config::ValidationRecall;
+use super::error::TrainError;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, Write};

@@ -6,7 +6,8 @@
 //! the vector, and a CRC-32. A segment is read up to its first damaged record, which is where a
 //! killed process stopped.
 
-use super::TrainError;
+use super::error::TrainError;
+use placeformer_core::progress::Task;
 use placeformer_core::types::{ContentHash, ImageTensor};
 use placeformer_vision::extract::Extractor;
 use placeformer_vision::image::{ImageConfig, load_tensor};
@@ -69,8 +70,8 @@ impl PooledCache {
         Ok(cache)
     }
 
-    /// The vectors `[images, dim]` of `images`, in their order; `progress` is told how many more
-    /// are done.
+    /// The vectors `[images, dim]` of `images`, in their order; `task` advances by
+    /// each image.
     ///
     /// # Errors
     /// An image cannot be read; all such images are found before the error is returned.
@@ -78,7 +79,7 @@ impl PooledCache {
         &mut self,
         extractor: &Extractor,
         images: &[PathBuf],
-        progress: &dyn Fn(u64),
+        task: &Task<'_>,
     ) -> Result<Vec<f32>, TrainError> {
         let limits = ImageConfig::default();
         let decode = |bytes: &[u8]| {
@@ -88,7 +89,7 @@ impl PooledCache {
             images,
             &decode,
             &|tensors| Ok(extractor.pooled(tensors)?),
-            progress,
+            task,
         )
     }
 
@@ -97,7 +98,7 @@ impl PooledCache {
         images: &[PathBuf],
         decode: &(dyn Fn(&[u8]) -> Result<ImageTensor, String> + Sync),
         encode: &Encode<'_>,
-        progress: &dyn Fn(u64),
+        task: &Task<'_>,
     ) -> Result<Vec<f32>, TrainError> {
         let (mut rows, mut unreadable) = (Vec::with_capacity(images.len() * self.dim), Vec::new());
         for batch in images.chunks(BATCH) {
@@ -138,7 +139,7 @@ impl PooledCache {
                     .filter_map(|hash| self.known.get(hash))
                     .flatten(),
             );
-            progress(batch.len() as u64);
+            task.add(batch.len() as u64);
         }
         if unreadable.is_empty() {
             return Ok(rows);
@@ -214,6 +215,7 @@ fn new_segment(folder: &Path) -> std::io::Result<File> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use placeformer_core::progress::Silent;
     use placeformer_core::types::ImageSize;
     use std::cell::Cell;
 
@@ -241,7 +243,7 @@ mod tests {
             images,
             &decode,
             &encode,
-            &|_| {},
+            &Task::begin(&Silent, "describing", images.len() as u64),
         )
     }
 

@@ -1,7 +1,7 @@
 //! Which images show a query's place, and which may serve as its negatives (paper III-F: 10 m and
 //! 25 m).
 
-use super::TrainError;
+use super::error::TrainError;
 use crate::datasets::{Dataset, Item, NeighbourGrid};
 use placeformer_core::geography::MetricPoint;
 use placeformer_core::types::ContentHash;

@@ -5,12 +5,12 @@
 //! once more and held in memory. The similarities are a plain matrix product; pairs are verified by
 //! the same homographies.
 
-use super::EvalError;
 use crate::datasets::{Dataset, Item};
+use crate::eval::error::EvalError;
 use crate::eval::features::Describe;
 use crate::eval::run::{Answer, Candidate, Neighbour};
-use indicatif::ProgressBar;
 use nalgebra::DMatrix;
+use placeformer_core::progress::Task;
 use placeformer_core::types::{KeyPatches, SCALES, ScaleSet};
 use placeformer_vision::rerank::{CombinationScore, PairScore, RerankConfig, Reranker};
 use rayon::prelude::*;
@@ -33,7 +33,7 @@ pub(super) fn rerank_all(
     answers: &[Answer],
     config: &RerankConfig,
     memory_bytes: u64,
-    progress: &ProgressBar,
+    task: &Task<'_>,
 ) -> Result<Option<FullPrecision>, EvalError> {
     let candidates: BTreeSet<usize> = answers
         .iter()
@@ -57,7 +57,7 @@ pub(super) fn rerank_all(
         let started = Instant::now();
         reranked.push(rerank(&reranker, &query, &database, answer));
         seconds += started.elapsed().as_secs_f64();
-        progress.inc(1);
+        task.add(1);
     }
     let mean = |sum: f64, count: usize| sum / count.max(1) as f64;
     let extra_bytes = mean(bytes as f64 * 0.75, database.len());

@@ -1,15 +1,35 @@
 //! The cuts by hand, the axes, and the whole table on a made-up model.
 
 use super::cuts::{coarsen, limit};
+use super::variants::{ALL_PATCHES, SIZE_ROWS};
 use super::*;
 use crate::datasets::Item;
 use half::f16;
+use placeformer_core::progress::{Silent, Step};
 use placeformer_core::types::{
-    ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid,
-    PoolingStride, ScaleKeyPatches,
+    ContentHash, Descriptor, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid,
+    PoolingStride, SCALES, ScaleKeyPatches,
 };
+use placeformer_vision::extract::{HeadChoice, Preset};
+use placeformer_vision::rerank::RerankConfig;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Mutex;
+
+/// The last state of every task.
+#[derive(Default)]
+struct Totals(Mutex<BTreeMap<String, (u64, Option<u64>)>>);
+
+impl Progress for Totals {
+    fn update(&self, step: Step<'_>) {
+        let state = (step.done, step.total);
+        self.0.lock().unwrap().insert(step.task.to_owned(), state);
+    }
+
+    fn end(&self, _task: &str) {}
+}
 
 fn patches() -> PackedPatches {
     PackedPatches {
@@ -281,9 +301,16 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
         cache: &cache,
         memory_bytes: 1 << 20,
     };
-    let hidden = MultiProgress::with_draw_target(indicatif::ProgressDrawTarget::hidden());
-    let Ablation { rows, left_out } = ablate(&dataset, &base, &open, &hidden).unwrap();
+    let totals = Totals::default();
+    let Ablation { rows, left_out } = ablate(&dataset, &base, &open, &totals).unwrap();
     assert!(left_out.is_empty(), "{left_out:?}");
+    let totals = totals.0.into_inner().unwrap();
+    let expected = (rows.len() as u64, Some(rows.len() as u64));
+    assert_eq!(
+        (totals["settings"], totals["images"]),
+        (expected, (5, Some(5)))
+    );
+    let hidden = &Silent;
     let row = |axis: &str, setting: &str| {
         rows.iter()
             .find(|row| row.axis == axis && row.setting == setting)
@@ -315,20 +342,20 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
             ..bare(&few)
         },
         &open,
-        &hidden,
+        hidden,
     );
     let prepared = prepared.unwrap();
     for variant in few_rows {
         let Cut::Limits { tau, caps } = variant.cut else {
             panic!("{}", variant.setting)
         };
-        let cut = prepared.row(&dataset, &variant, &hidden).unwrap().unwrap();
+        let cut = prepared.row(&dataset, &variant, hidden).unwrap().unwrap();
         let config = ExtractConfig {
             tau,
             caps: caps.map(|cap| cap.min(1 << 16)),
             ..bare(&few)
         };
-        let own = Prepared::new(&dataset, &few_base, &config, &open, &hidden).unwrap();
+        let own = Prepared::new(&dataset, &few_base, &config, &open, hidden).unwrap();
         let own = own
             .row(
                 &dataset,
@@ -336,7 +363,7 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
                     cut: Cut::None,
                     ..variant
                 },
-                &hidden,
+                hidden,
             )
             .unwrap()
             .unwrap();
@@ -360,7 +387,7 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
             ..base
         },
         &open,
-        &hidden,
+        hidden,
     )
     .unwrap();
     assert_eq!(small.rows.len() + 1, rows.len());

@@ -1,6 +1,7 @@
 //! The cache on made-up images: what is read again, what is computed anew, what is listed.
 
 use super::*;
+use placeformer_core::progress::Silent;
 use placeformer_core::types::{ImageSize, PatchGrid, PoolingStride};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -100,7 +101,13 @@ fn run(
 ) -> (FeatureCache, Features) {
     let cache = FeatureCache::open(root, describer, 1 << 20).unwrap();
     let features = cache
-        .describe_all(describer, items, "database", kind, &ProgressBar::hidden())
+        .describe_all(
+            describer,
+            items,
+            "database",
+            kind,
+            &Task::begin(&Silent, "describing", items.len() as u64),
+        )
         .unwrap();
     (cache, features)
 }

@@ -1,6 +1,6 @@
 //! Dealing answers to the folds of a cross-validation: places stay whole, folds come out alike.
 
-use super::calibration::TopOne;
+use super::answers::TopOne;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;

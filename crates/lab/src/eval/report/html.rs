@@ -1,58 +1,60 @@
 //! The frame of every report page: one self-contained file, readable in light and dark, on paper
 //! and by a screen reader.
 
-/// Text made safe for HTML content and attributes.
-pub fn escape(text: &str) -> String {
-    let mut safe = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => safe.push_str("&amp;"),
-            '<' => safe.push_str("&lt;"),
-            '>' => safe.push_str("&gt;"),
-            '"' => safe.push_str("&quot;"),
-            '\'' => safe.push_str("&#39;"),
-            other => safe.push(other),
+use maud::{DOCTYPE, Markup, PreEscaped, Render, html};
+
+/// A whole page around `body`.
+pub fn page(title: &str, body: &Markup) -> String {
+    let page = html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width,initial-scale=1";
+                meta name="color-scheme" content="light dark";
+                title { (title) }
+                style { (PreEscaped(STYLE)) }
+            }
+            body {
+                main {
+                    h1 { (title) }
+                    (body)
+                }
+            }
+        }
+    };
+    page.into_string()
+}
+
+/// A table whose first column names the row.
+pub fn table(caption: &str, headers: &[&str], rows: &[Vec<impl Render>]) -> Markup {
+    html! {
+        div.scroll {
+            table {
+                caption { (caption) }
+                thead {
+                    tr {
+                        @for header in headers {
+                            th scope="col" { (header) }
+                        }
+                    }
+                }
+                tbody {
+                    @for cells in rows {
+                        tr {
+                            @for (column, cell) in cells.iter().enumerate() {
+                                @if column == 0 {
+                                    th scope="row" { (cell) }
+                                } @else {
+                                    td { (cell) }
+                                }
+                            }
+                        }
+                    }
+                }
+            }
         }
     }
-    safe
-}
-
-/// A whole page around `body`, which is HTML.
-pub fn page(title: &str, body: &str) -> String {
-    let title = escape(title);
-    format!(
-        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
-         <meta name=\"viewport\" content=\"width=device-width,initial-scale=1\">\
-         <meta name=\"color-scheme\" content=\"light dark\"><title>{title}</title><style>{STYLE}</style></head>\n\
-         <body><main><h1>{title}</h1>\n{body}</main></body></html>\n"
-    )
-}
-
-/// A table; cells are HTML, the first column names the row.
-pub fn table(caption: &str, headers: &[&str], rows: &[Vec<String>]) -> String {
-    let head: String = headers
-        .iter()
-        .map(|header| format!("<th scope=\"col\">{}</th>", escape(header)))
-        .collect();
-    let row = |cells: &Vec<String>| {
-        let cells: String = cells
-            .iter()
-            .enumerate()
-            .map(|(i, cell)| {
-                if i == 0 {
-                    format!("<th scope=\"row\">{cell}</th>")
-                } else {
-                    format!("<td>{cell}</td>")
-                }
-            })
-            .collect();
-        format!("<tr>{cells}</tr>\n")
-    };
-    let body: String = rows.iter().map(row).collect();
-    format!(
-        "<div class=\"scroll\"><table><caption>{}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>\n",
-        escape(caption)
-    )
 }
 
 const STYLE: &str = "
@@ -89,11 +91,16 @@ mod tests {
 
     #[test]
     fn nothing_in_a_name_can_become_markup() {
-        assert_eq!(
-            escape("<a href='x'>&\""),
-            "&lt;a href=&#39;x&#39;&gt;&amp;&quot;"
+        let name = "<a href='x'>&\"";
+        let cells = table("c", &["h"], &[vec![name, name]]).into_string();
+        // In text a single quote is just that, and attributes are in double quotes.
+        assert!(
+            cells.contains("<td>&lt;a href='x'&gt;&amp;&quot;</td>"),
+            "{cells}"
         );
-        let page = page("<t>", "");
+        let attribute = html! { img alt=(name); }.into_string();
+        assert_eq!(attribute, "<img alt=\"&lt;a href='x'&gt;&amp;&quot;\">");
+        let page = page("<t>", &html! {});
         assert!(page.contains("<title>&lt;t&gt;</title>") && !page.contains("http"));
     }
 }

@@ -3,9 +3,10 @@
 
 use super::*;
 use crate::synth::{Condition, StreetWorld, Viewpoint};
+use crate::train::Schedule;
+use crate::train::interruption::InterruptAfter;
 use crate::train::loss::triplet_margin_loss;
 use crate::train::triplets::Side;
-use crate::train::{Progress, Schedule};
 use placeformer_core::types::ImageSize;
 use placeformer_vision::extract::{
     BlockWeights, CandleEncoder, Encoder, Geometry, Linear, Norm, Preset,
@@ -322,16 +323,11 @@ fn train_in(
         augmentation: config.augmentation,
         ..model(TrainableBlocks::Last(1), false)
     };
-    let mut progress = |progress: Progress<'_>| match progress {
-        Progress::Cycle(record) if record.step >= stop_after => {
-            std::panic::panic_any("interrupted")
-        }
-        _ => {}
-    };
+    let interrupt = InterruptAfter(stop_after);
     let session = Session {
         folder: folder.to_owned(),
         identity: "drawn".into(),
-        progress: &mut progress,
+        progress: &interrupt,
     };
     let run = std::panic::AssertUnwindSafe(|| model.train(set, set, config, session).unwrap());
     let outcome = std::panic::catch_unwind(run).ok()?;

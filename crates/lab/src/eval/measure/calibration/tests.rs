@@ -1,5 +1,8 @@
 //! Fits on planted truths, folds, thresholds by hand.
 
+use super::super::answers::Prediction;
+use super::super::cross_validation::Unseen;
+use super::super::threshold::{trusted, wilson};
 use super::*;
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
