@@ -1,5 +1,6 @@
 //! In the steady state, the stages of a query allocate their answers and little else: buffers are
 //! kept, matrices of similarities and scores never exist.
+#![cfg(feature = "lab")]
 
 use placeformer_core::types::{ImageSize, ImageTensor, ReferenceFilter};
 use placeformer_kernels::Simd;

@@ -1,5 +1,6 @@
 //! From photos to places with the real model: a town is imported into a server and recognised
 //! again.
+#![cfg(feature = "lab")]
 
 #[path = "common/town.rs"]
 mod town;

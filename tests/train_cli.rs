@@ -1,4 +1,5 @@
 //! `train`, `head train`, `head fit` and `map rehead` from flags to files, on a small drawn town.
+#![cfg(feature = "lab")]
 
 #[path = "common/town.rs"]
 mod town;

@@ -35,7 +35,12 @@ pub struct BenchArgs {
     #[arg(long)]
     end_to_end: bool,
     /// References of the map, with --end-to-end; random ones beyond the drawn.
-    #[arg(long, value_delimiter = ',', default_values_t = [1_000, 100_000, 1_000_000], requires = "end_to_end")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_values_t = [1_000, 100_000, 1_000_000],
+        requires = "end_to_end"
+    )]
     references: Vec<u64>,
     /// Drawn references with patches, with --end-to-end.
     #[arg(long, default_value_t = 1_000, requires = "end_to_end")]
@@ -104,22 +109,13 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
     };
     say!("{}", table::machine(&report))?;
     if args.end_to_end {
-        let plan = EndToEnd {
-            references: &args.references,
-            drawn: args.drawn,
-            clients: &args.clients,
-            seconds: args.seconds,
-            extractor: &extractor,
-            folder: &folder,
-            peers: args.peers.as_deref().map(|python| (python, path.as_path())),
-        };
+        let plan = args.end_to_end_plan(&extractor, &folder, &path);
         report.end_to_end = plan.measure()?;
     } else {
-        let spec = config.encoder_spec()?;
         let bench = Bench {
             extractor,
             weights,
-            spec,
+            spec: config.encoder_spec()?,
             limits,
             folder,
             rounds: args.rounds as usize,
@@ -137,6 +133,25 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
         say!("{}", table::rows(&report.rows))?;
     }
     Ok(())
+}
+
+impl BenchArgs {
+    fn end_to_end_plan<'a>(
+        &'a self,
+        extractor: &'a Extractor,
+        folder: &'a Path,
+        weights: &'a Path,
+    ) -> EndToEnd<'a> {
+        EndToEnd {
+            references: &self.references,
+            drawn: self.drawn,
+            clients: &self.clients,
+            seconds: self.seconds,
+            extractor,
+            folder,
+            peers: self.peers.as_deref().map(|python| (python, weights)),
+        }
+    }
 }
 
 fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<BenchRow>> {

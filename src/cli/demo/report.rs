@@ -46,10 +46,8 @@ impl Asked {
         let found = |result: &Value| {
             let reference = result["external_id"].as_str()?.to_owned();
             let right = right.contains(&reference);
-            let (distance, score) = (
-                result["global_distance"].as_f64()?,
-                result["spatial_score"].as_u64()?,
-            );
+            let distance = result["global_distance"].as_f64()?;
+            let score = result["spatial_score"].as_u64()?;
             Some(Found {
                 reference,
                 distance,
@@ -174,12 +172,14 @@ pub(super) fn summary(asked: &[Asked]) -> String {
         .min();
     let highest_unmapped = unmapped.map(Asked::best_score).max();
     let mut text = format!(
-        "Right at rank 1: {globally} of {} by the global descriptor alone, {reranked} after re-ranking.",
+        "Right at rank 1: {globally} of {} by the global descriptor alone, \
+         {reranked} after re-ranking.",
         mapped.len()
     );
     if let (Some(lowest), Some(highest)) = (lowest_right, highest_unmapped) {
         text += &format!(
-            "\nPlaces that are not in the map score at most S = {highest}; right answers score at least {lowest}."
+            "\nPlaces that are not in the map score at most S = {highest}; \
+             right answers score at least {lowest}."
         );
     }
     let trusted: Vec<&Asked> = asked

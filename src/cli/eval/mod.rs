@@ -17,15 +17,22 @@ use std::path::Path;
 
 const EXAMPLES: &str = "Examples:
   placeformer eval --dataset msls-val --root /data/msls --html report.html
-  placeformer eval --dataset msls-test --root /data/msls --predictions answers.txt  (the challenge's file)
-  placeformer eval --dataset csv --root DIR --leave-out --calibration own.json      (can unknown places be told?)
+  placeformer eval --dataset msls-test --root /data/msls --predictions answers.txt  \
+(the challenge's file)
+  placeformer eval --dataset csv --root DIR --leave-out --calibration own.json      \
+(can unknown places be told?)
 
-The 95% intervals come from resampling queries as if they were independent. Frames that follow each other along a street
+The 95% intervals come from resampling queries as if they were independent. Frames that follow \
+each other along a street
 are not, so there the truth is wider.";
 
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
-#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true, after_help = EXAMPLES)]
+#[command(
+    args_conflicts_with_subcommands = true,
+    subcommand_negates_reqs = true,
+    after_help = EXAMPLES
+)]
 pub struct EvalArgs {
     #[command(subcommand)]
     action: Option<Action>,

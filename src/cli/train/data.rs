@@ -224,11 +224,9 @@ mod tests {
             for side in ["database", "query"] {
                 let folder = root.path().join("train_val").join(city).join(side);
                 std::fs::create_dir_all(folder.join("images")).unwrap();
-                let (mut raw, mut post, mut index) = (
-                    ",key,ca,pano\n".to_owned(),
-                    ",key,easting,northing\n".to_owned(),
-                    ",key,all\n".to_owned(),
-                );
+                let mut raw = ",key,ca,pano\n".to_owned();
+                let mut post = ",key,easting,northing\n".to_owned();
+                let mut index = ",key,all\n".to_owned();
                 for place in 0..3 {
                     let key = format!("{city}-{side}-{place}");
                     std::fs::write(folder.join("images").join(format!("{key}.jpg")), b"x").unwrap();
@@ -292,7 +290,8 @@ mod tests {
     #[test]
     fn an_image_on_both_sides_is_refused_by_whatever_way_it_is_reached() {
         let root = msls();
-        let (plain, detour) = (root.path().to_owned(), root.path().join("train_val/.."));
+        let plain = root.path().to_owned();
+        let detour = root.path().join("train_val/..");
         let refused = load(&[
             "--dataset",
             "msls-val",

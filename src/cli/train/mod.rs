@@ -155,7 +155,8 @@ pub fn run(args: TrainArgs) -> anyhow::Result<()> {
         Trainable::Head => {
             ensure!(
                 args.augmentation.is_unset(),
-                "a head is trained on cached tokens, which cannot be varied: leave the augmentation flags out"
+                "a head is trained on cached tokens, which cannot be varied: \
+                 leave the augmentation flags out"
             );
             head::train(&args.run)
         }

@@ -180,7 +180,8 @@ impl Bench<'_> {
             }
             Reranked::DeadlinePassed => 0,
         };
-        let (our_inliers, plain_inliers): (usize, usize) = (ours(), baselines::rerank(&scene)?);
+        let our_inliers: usize = ours();
+        let plain_inliers: usize = baselines::rerank(&scene)?;
         agree(
             name,
             our_inliers as f64 >= 0.97 * plain_inliers as f64,

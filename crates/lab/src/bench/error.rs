@@ -27,7 +27,8 @@ pub enum BenchError {
     },
     /// A quotient of two times that is not a number, such as where none passed.
     #[error(
-        "{row}: {ours_ms} ms beside {baseline_ms} ms with a limit of {limit_ms} ms cannot be compared"
+        "{row}: {ours_ms} ms beside {baseline_ms} ms with a limit of {limit_ms} ms \
+         cannot be compared"
     )]
     NotComparable {
         /// The row.

@@ -81,7 +81,8 @@ impl Bench<'_> {
     pub(super) fn commit(&self) -> Result<BenchRow, BenchError> {
         let folder = self.new_folder("commit")?;
         let open = |name| SqliteStore::open(&folder.join(name), &StoreConfig::default());
-        let (shared, alone) = (open("shared")?, open("alone")?);
+        let shared = open("shared")?;
+        let alone = open("alone")?;
         let scene = RerankScene::new(0.4);
         let news: Vec<NewReference> = scene
             .candidates
@@ -150,7 +151,8 @@ fn reference_of((patches, number): (&KeyPatches, u64)) -> NewReference {
 
 /// A reference to be stored in [`street_map`].
 pub(super) fn new_reference(content_hash: ContentHash, descriptor: Descriptor) -> NewReference {
-    let (map, model) = (street_map(), ModelId::new("scene"));
+    let map = street_map();
+    let model = ModelId::new("scene");
     NewReference {
         map,
         fields: ReferenceFields::default(),

@@ -37,14 +37,11 @@ impl Bench<'_> {
             agree(name, same, || "the distances differ".into())?;
         }
 
-        let rounds = match size {
-            size if size > LARGE => 3 * self.rounds,
-            _ => 20 * self.rounds,
-        };
+        let repeats = if size > LARGE { 3 } else { 20 };
         let mut our_queries = queries.iter().cycle();
         let mut plain_queries = queries.iter().cycle();
         let times = paired(
-            rounds,
+            repeats * self.rounds,
             || {
                 let query = our_queries.next().map_or(&[][..], Vec::as_slice);
                 index.search(query, NEAREST, &everything)

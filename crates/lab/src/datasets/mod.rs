@@ -40,8 +40,8 @@ use std::path::Path;
 /// Reads the data set `kind` that lies at `root`.
 ///
 /// # Errors
-/// An option is out of range, the folder does not have the layout of that data set, a file cannot be
-/// read, or one side has no image.
+/// An option is out of range, the folder does not have the layout of that data set, a file cannot
+/// be read, or one side has no image.
 pub fn load(
     kind: DatasetKind,
     root: &Path,

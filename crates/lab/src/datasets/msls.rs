@@ -20,7 +20,7 @@ use placeformer_core::folder::list_images;
 use placeformer_core::geography::MetricPoint;
 use std::collections::hash_map::Entry;
 use std::collections::{HashMap, HashSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 const EXPECTED: &str =
     "train_val/<city>/{database,query}/{images,raw.csv,postprocessed.csv,subtask_index.csv}";
@@ -52,42 +52,23 @@ pub(super) fn load_labelled(
         };
         return utm::load(name, root, &options);
     }
+
     let folder = require(name, root.join("train_val"), EXPECTED)?;
-    let mut reader = Reader {
-        subtask: &options.subtask,
-        split,
-        skipped: Vec::new(),
-        without_angle: 0,
-    };
-    let (mut database, mut queries) = (Vec::new(), Vec::new());
+    let mut reader = Reader::new(name, &options.subtask, split);
+    let mut database = Vec::new();
+    let mut queries = Vec::new();
     for city in cities(&folder, split, options)? {
-        database.extend(reader.labelled_side(name, &folder, &city, "database")?);
-        queries.extend(reader.labelled_side(name, &folder, &city, "query")?);
+        database.extend(reader.labelled_side(&folder, &city, "database")?);
+        queries.extend(reader.labelled_side(&folder, &city, "query")?);
     }
     let truth = truth_by_distance(&database, &queries, options.radius_m, Some(angle));
-    let mut notes = vec![format!(
-        "positives lie within {} m and {angle} degrees of view angle",
-        options.radius_m
-    )];
-    if split == Split::Train && options.subtask != DatasetOptions::default().subtask {
-        notes.push(format!(
-            "subtask {:?} chooses among validation images only; training takes all",
-            options.subtask
-        ));
-    }
-    if reader.without_angle > 0 {
-        notes.push(format!(
-            "{} images have no compass angle; for them only the distance counts",
-            reader.without_angle
-        ));
-    }
     Ok(Dataset {
         name: name.into(),
         database,
         queries,
         truth,
+        notes: reader.notes(options, angle),
         skipped: reader.skipped,
-        notes,
     })
 }
 
@@ -95,16 +76,12 @@ pub(super) fn load_labelled(
 pub(super) fn load_test(root: &Path, options: &DatasetOptions) -> Result<Dataset, DatasetError> {
     let name = "msls-test";
     let folder = require(name, root.join("test"), EXPECTED_TEST)?;
-    let mut reader = Reader {
-        subtask: &options.subtask,
-        split: Split::Test,
-        skipped: Vec::new(),
-        without_angle: 0,
-    };
-    let (mut database, mut queries) = (Vec::new(), Vec::new());
+    let mut reader = Reader::new(name, &options.subtask, Split::Test);
+    let mut database = Vec::new();
+    let mut queries = Vec::new();
     for city in cities(&folder, Split::Test, options)? {
-        database.extend(reader.test_side(name, &folder, &city, "database")?);
-        queries.extend(reader.test_side(name, &folder, &city, "query")?);
+        database.extend(reader.test_side(&folder, &city, "database")?);
+        queries.extend(reader.test_side(&folder, &city, "query")?);
     }
     let truth = vec![Truth::Unknown; queries.len()];
     let notes = vec!["answers are withheld: write a prediction file and submit it".to_owned()];
@@ -147,66 +124,106 @@ fn cities(
     }
 }
 
+/// Reads the sides of cities, and remembers what it leaves out.
 struct Reader<'a> {
+    dataset: &'static str,
     subtask: &'a str,
     split: Split,
     skipped: Vec<Skipped>,
     without_angle: usize,
 }
 
-impl Reader<'_> {
-    fn skip(&mut self, city: &str, side: &str, key: &str, reason: &str) {
+/// One side of a city, and where its files are.
+struct CitySide<'a> {
+    city: &'a str,
+    /// `database` or `query`.
+    side: &'a str,
+    folder: PathBuf,
+}
+
+impl CitySide<'_> {
+    fn item(&self, key: &str) -> Item {
+        let path = self.folder.join("images").join(format!("{key}.jpg"));
+        Item {
+            group: Some(self.city.to_owned()),
+            ..Item::new(self.name_of(key), path)
+        }
+    }
+
+    fn name_of(&self, key: &str) -> String {
+        format!("{}/{}/{key}", self.city, self.side)
+    }
+}
+
+impl<'a> Reader<'a> {
+    fn new(dataset: &'static str, subtask: &'a str, split: Split) -> Self {
+        Self {
+            dataset,
+            subtask,
+            split,
+            skipped: Vec::new(),
+            without_angle: 0,
+        }
+    }
+
+    fn skip(&mut self, side: &CitySide<'_>, key: &str, reason: &str) {
         self.skipped.push(Skipped {
-            name: format!("{city}/{side}/{key}"),
+            name: side.name_of(key),
             reason: reason.into(),
         });
     }
 
+    /// What a reader of the results should know about labelled cities.
+    fn notes(&self, options: &DatasetOptions, angle: f64) -> Vec<String> {
+        let mut notes = vec![format!(
+            "positives lie within {} m and {angle} degrees of view angle",
+            options.radius_m
+        )];
+        if self.split == Split::Train && options.subtask != DatasetOptions::default().subtask {
+            notes.push(format!(
+                "subtask {:?} chooses among validation images only; training takes all",
+                options.subtask
+            ));
+        }
+        if self.without_angle > 0 {
+            notes.push(format!(
+                "{} images have no compass angle; for them only the distance counts",
+                self.without_angle
+            ));
+        }
+        notes
+    }
+
+    /// A side of a city that has positions.
     fn labelled_side(
         &mut self,
-        dataset: &'static str,
         root: &Path,
         city: &str,
         side: &str,
     ) -> Result<Vec<Item>, DatasetError> {
-        let folder = require(dataset, root.join(city).join(side), EXPECTED)?;
-        let raw = self.raw_rows(
-            &require(dataset, folder.join("raw.csv"), EXPECTED)?,
-            city,
-            side,
-        )?;
-        let positions = self.positions(
-            &require(dataset, folder.join("postprocessed.csv"), EXPECTED)?,
-            city,
-            side,
-        )?;
-        let subtask = match self.split {
-            Split::Train => None,
-            Split::Val | Split::Test => Some(self.subtask_keys(&require(
-                dataset,
-                folder.join("subtask_index.csv"),
-                EXPECTED,
-            )?)?),
-        };
-        self.report_images_without_rows(&folder, city, side, &positions)?;
+        let folder = require(self.dataset, root.join(city).join(side), EXPECTED)?;
+        let raw_path = require(self.dataset, folder.join("raw.csv"), EXPECTED)?;
+        let positions_path = require(self.dataset, folder.join("postprocessed.csv"), EXPECTED)?;
+        let side = CitySide { city, side, folder };
+        let raw = self.raw_rows(&raw_path, &side)?;
+        let positions = self.positions(&positions_path, &side)?;
+        let chosen = self.chosen_keys(&side)?;
+        self.report_images_without_rows(&side, &positions)?;
+
         let mut items = Vec::new();
         for (key, position) in &positions {
-            if subtask
-                .as_ref()
-                .is_some_and(|keys| !keys.contains(key.as_str()))
-            {
+            if chosen.as_ref().is_some_and(|keys| !keys.contains(key)) {
                 continue;
             }
             match raw.get(key) {
-                None => self.skip(city, side, key, "no row in raw.csv"),
-                Some(RawRow { panorama: true, .. }) => self.skip(city, side, key, "panorama"),
+                None => self.skip(&side, key, "no row in raw.csv"),
+                Some(RawRow { panorama: true, .. }) => self.skip(&side, key, "panorama"),
                 Some(RawRow { angle, .. }) => {
                     self.without_angle += usize::from(angle.is_none());
-                    let item = image_item(&folder, city, side, key);
                     items.push(Item {
                         position: Some(*position),
                         heading: *angle,
-                        ..item
+                        ..side.item(key)
                     });
                 }
             }
@@ -214,32 +231,32 @@ impl Reader<'_> {
         Ok(items)
     }
 
+    /// A side of a city whose positions are withheld.
     fn test_side(
         &mut self,
-        dataset: &'static str,
         root: &Path,
         city: &str,
         side: &str,
     ) -> Result<Vec<Item>, DatasetError> {
-        let folder = require(dataset, root.join(city).join(side), EXPECTED_TEST)?;
-        let path = require(dataset, folder.join("subtask_index.csv"), EXPECTED_TEST)?;
+        let folder = require(self.dataset, root.join(city).join(side), EXPECTED_TEST)?;
+        let index = folder.join("subtask_index.csv");
+        let path = require(self.dataset, index, EXPECTED_TEST)?;
+        let side = CitySide { city, side, folder };
         let table = Table::read(&path)?;
-        let (key_column, subtask_column) = (table.column("key")?, table.column(self.subtask)?);
-        let (mut items, mut seen) = (Vec::new(), HashSet::new());
+        let key_column = table.column("key")?;
+        let subtask_column = table.column(self.subtask)?;
+        let mut items = Vec::new();
+        let mut seen = HashSet::new();
         for row in table.rows() {
             let key = row.text(key_column);
             if !row.flag(subtask_column)? {
                 continue;
             }
             if seen.insert(key) {
-                items.push(image_item(&folder, city, side, key));
+                items.push(side.item(key));
             } else {
-                self.skip(
-                    city,
-                    side,
-                    key,
-                    "a second row with this key in subtask_index.csv",
-                );
+                let reason = "a second row with this key in subtask_index.csv";
+                self.skip(&side, key, reason);
             }
         }
         Ok(items)
@@ -249,73 +266,74 @@ impl Reader<'_> {
     fn positions(
         &mut self,
         path: &Path,
-        city: &str,
-        side: &str,
+        side: &CitySide<'_>,
     ) -> Result<Vec<(String, MetricPoint)>, DatasetError> {
         let table = Table::read(path)?;
-        let (key, east, north) = (
-            table.column("key")?,
-            table.column("easting")?,
-            table.column("northing")?,
-        );
-        let (mut positions, mut seen) = (Vec::new(), HashSet::new());
+        let key_column = table.column("key")?;
+        let east = table.column("easting")?;
+        let north = table.column("northing")?;
+        let mut positions = Vec::new();
+        let mut seen = HashSet::new();
         for row in table.rows() {
-            let name = row.text(key);
-            if seen.insert(name) {
-                positions.push((
-                    name.to_owned(),
-                    MetricPoint {
-                        east: row.number(east)?,
-                        north: row.number(north)?,
-                    },
-                ));
+            let key = row.text(key_column);
+            if seen.insert(key) {
+                let position = MetricPoint {
+                    east: row.number(east)?,
+                    north: row.number(north)?,
+                };
+                positions.push((key.to_owned(), position));
             } else {
-                self.skip(
-                    city,
-                    side,
-                    name,
-                    "a second row with this key in postprocessed.csv",
-                );
+                let reason = "a second row with this key in postprocessed.csv";
+                self.skip(side, key, reason);
             }
         }
         Ok(positions)
     }
 
+    /// Rows of `raw.csv` by key; the first row of a key counts, as in `postprocessed.csv`.
     fn raw_rows(
         &mut self,
         path: &Path,
-        city: &str,
-        side: &str,
+        side: &CitySide<'_>,
     ) -> Result<HashMap<String, RawRow>, DatasetError> {
         let table = Table::read(path)?;
-        let (key, pano) = (table.column("key")?, table.column("pano")?);
-        let angle = table.optional_column("ca");
+        let key_column = table.column("key")?;
+        let panorama_column = table.column("pano")?;
+        let angle_column = table.optional_column("ca");
         let mut rows = HashMap::new();
         for row in table.rows() {
             // Some cities lack the angle of some images: an empty field, or NaN.
-            let angle = angle
+            let angle = angle_column
                 .and_then(|column| row.text(column).parse::<f64>().ok())
                 .filter(|angle| angle.is_finite());
-            let name = row.text(key);
-            // The first row counts, as in postprocessed.csv.
-            match rows.entry(name.to_owned()) {
+            let key = row.text(key_column);
+            match rows.entry(key.to_owned()) {
                 Entry::Occupied(_) => {
-                    self.skip(city, side, name, "a second row with this key in raw.csv")
+                    self.skip(side, key, "a second row with this key in raw.csv");
                 }
-                Entry::Vacant(place) => {
-                    place.insert(RawRow {
-                        angle,
-                        panorama: row.flag(pano)?,
-                    });
+                Entry::Vacant(entry) => {
+                    let panorama = row.flag(panorama_column)?;
+                    entry.insert(RawRow { angle, panorama });
                 }
             }
         }
         Ok(rows)
     }
 
+    /// The images that the subtask chooses; `None` for training, which takes all.
+    fn chosen_keys(&self, side: &CitySide<'_>) -> Result<Option<HashSet<String>>, DatasetError> {
+        if self.split == Split::Train {
+            return Ok(None);
+        }
+        let index = side.folder.join("subtask_index.csv");
+        let path = require(self.dataset, index, EXPECTED)?;
+        Ok(Some(self.subtask_keys(&path)?))
+    }
+
     fn subtask_keys(&self, path: &Path) -> Result<HashSet<String>, DatasetError> {
         let table = Table::read(path)?;
-        let (key, subtask) = (table.column("key")?, table.column(self.subtask)?);
+        let key = table.column("key")?;
+        let subtask = table.column(self.subtask)?;
         let mut keys = HashSet::new();
         for row in table.rows() {
             if row.flag(subtask)? {
@@ -327,32 +345,24 @@ impl Reader<'_> {
 
     fn report_images_without_rows(
         &mut self,
-        folder: &Path,
-        city: &str,
-        side: &str,
+        side: &CitySide<'_>,
         positions: &[(String, MetricPoint)],
     ) -> Result<(), DatasetError> {
         let known: HashSet<&str> = positions.iter().map(|(key, _)| key.as_str()).collect();
-        for (name, _) in list_images(&folder.join("images"))? {
-            let key = name
-                .rsplit_once('.')
-                .map_or(name.as_str(), |(stem, _)| stem);
+        for (name, _) in list_images(&side.folder.join("images"))? {
+            let key = match name.rsplit_once('.') {
+                Some((stem, _)) => stem,
+                None => &name,
+            };
             if !known.contains(key) {
-                self.skip(city, side, key, "no row in postprocessed.csv");
+                self.skip(side, key, "no row in postprocessed.csv");
             }
         }
         Ok(())
     }
 }
 
-fn image_item(folder: &Path, city: &str, side: &str, key: &str) -> Item {
-    let path = folder.join("images").join(format!("{key}.jpg"));
-    Item {
-        group: Some(city.to_owned()),
-        ..Item::new(format!("{city}/{side}/{key}"), path)
-    }
-}
-
+/// What `raw.csv` says about an image.
 struct RawRow {
     angle: Option<f64>,
     panorama: bool,

@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 const EXPECTED: &str =
     "images/{train,val,test}/{database,queries} with @utm_east@utm_north@...@.jpg names";
 
-/// The group of images whose zone nobody knows, beside images of several regions.
+/// The group of images that name no zone, where other images are of several regions.
 const NO_ZONE: &str = "zone unknown";
 
 /// Reads one split; positives by radius, and by view angle where the options ask for it and the
@@ -32,33 +32,26 @@ pub(super) fn load(
     options: &DatasetOptions,
 ) -> Result<Dataset, DatasetError> {
     let split = options.split.unwrap_or(Split::Test);
-    let wanted = || root.join("images").join(split.as_str());
     let folder = find_split(root, split).ok_or_else(|| DatasetError::Layout {
         dataset: name,
-        path: wanted(),
+        path: root.join("images").join(split.as_str()),
         expected: EXPECTED,
     })?;
+    let database_dir = require(name, folder.join("database"), EXPECTED)?;
+    let queries_dir = require(name, folder.join("queries"), EXPECTED)?;
     let mut skipped = Vec::new();
-    let mut database = read(
-        &require(name, folder.join("database"), EXPECTED)?,
-        &mut skipped,
-    )?;
-    let mut queries = read(
-        &require(name, folder.join("queries"), EXPECTED)?,
-        &mut skipped,
-    )?;
+    let mut database = read(&database_dir, &mut skipped)?;
+    let mut queries = read(&queries_dir, &mut skipped)?;
     let mut notes = project([&mut database, &mut queries]);
-    let (database, queries) = (items(database), items(queries));
+    let database = items(database);
+    let queries = items(queries);
     if let Some(angle) = options.max_angle_deg {
         notes.push(format!(
             "positives lie within {} m and {angle} degrees of view angle",
             options.radius_m
         ));
-        let without = database
-            .iter()
-            .chain(&queries)
-            .filter(|item| item.heading.is_none())
-            .count();
+        let all = database.iter().chain(&queries);
+        let without = all.filter(|item| item.heading.is_none()).count();
         if without > 0 {
             notes.push(format!(
                 "{without} images have no view angle; for them only the distance counts"
@@ -92,13 +85,13 @@ pub(super) fn find_split(root: &Path, split: Split) -> Option<PathBuf> {
 }
 
 /// An image and the grid its coordinates refer to.
-struct Placed {
+struct GridImage {
     item: Item,
     point: MetricPoint,
     zone: Option<UtmZone>,
 }
 
-fn read(folder: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<Placed>, DatasetError> {
+fn read(folder: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<GridImage>, DatasetError> {
     let mut images = Vec::new();
     for (name, path) in list_images(folder)? {
         match UtmName::parse(&name) {
@@ -109,7 +102,7 @@ fn read(folder: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<Placed>, Datase
                     heading,
                     ..Item::new(name, path)
                 };
-                images.push(Placed {
+                images.push(GridImage {
                     item,
                     point: parsed.point,
                     zone: parsed.zone,
@@ -126,24 +119,21 @@ fn read(folder: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<Placed>, Datase
 
 /// Brings all positions into the plane of their cluster of zones, and tells clusters apart by the
 /// items' group.
-fn project(mut sides: [&mut Vec<Placed>; 2]) -> Vec<String> {
-    let zones = Zones::of(
-        sides
-            .iter()
-            .flat_map(|side| side.iter().filter_map(|placed| placed.zone)),
-    );
-    let (mut without_zone, mut off_the_grid) = (0, 0);
-    for placed in sides.iter_mut().flat_map(|side| side.iter_mut()) {
-        match placed.zone {
+fn project(mut sides: [&mut Vec<GridImage>; 2]) -> Vec<String> {
+    let images = sides.iter().flat_map(|side| side.iter());
+    let zones = Zones::of(images.filter_map(|image| image.zone));
+    let mut without_zone = 0;
+    let mut off_the_grid = 0;
+    for image in sides.iter_mut().flat_map(|side| side.iter_mut()) {
+        match image.zone {
             Some(zone) => {
-                placed.item.position = zones.project(zone, placed.point);
-                placed.item.group = zones.group(zone);
-                off_the_grid += usize::from(placed.item.position.is_none());
+                image.item.position = zones.project(zone, image.point);
+                image.item.group = zones.group(zone);
+                off_the_grid += usize::from(image.item.position.is_none());
             }
-            // Where there is but one plane, a name that leaves the zone out is taken to mean that
-            // one.
+            // Where there is only one plane, a name that leaves the zone out is taken to mean it.
             None if zones.are_apart() => {
-                placed.item.group = Some(NO_ZONE.to_owned());
+                image.item.group = Some(NO_ZONE.to_owned());
                 without_zone += 1;
             }
             None => {}
@@ -163,8 +153,8 @@ fn project(mut sides: [&mut Vec<Placed>; 2]) -> Vec<String> {
     notes
 }
 
-fn items(side: Vec<Placed>) -> Vec<Item> {
-    side.into_iter().map(|placed| placed.item).collect()
+fn items(side: Vec<GridImage>) -> Vec<Item> {
+    side.into_iter().map(|image| image.item).collect()
 }
 
 #[cfg(test)]

@@ -11,5 +11,5 @@ mod panels;
 mod thumbnail;
 
 pub use error::DrawError;
-pub use panels::{AttentionMap, CombinationLines, MatchSide, attention_picture, match_picture};
+pub use panels::{AttentionMap, CombinationLines, DrawnSide, attention_picture, match_picture};
 pub use thumbnail::{jpeg_data_uri, thumbnail};

@@ -10,7 +10,8 @@
 //! | [`summary`], [`mod@summarise`] | all numbers of a run as one value, and how it is made |
 //! | [`calibrate`] | from answers to how far they can be trusted |
 //! | [`mod@ablate`] | the same along the axes of the paper's tables |
-//! | [`report`], [`evidence`], [`prediction`] | text, pages, pictures, and files of the benchmarks |
+//! | [`report`], [`evidence`] | text, pages, pictures |
+//! | [`prediction`] | files that the public benchmarks accept |
 
 pub mod ablate;
 pub mod answers;

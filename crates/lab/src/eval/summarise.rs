@@ -3,7 +3,7 @@
 use super::answers::DatasetAnswers;
 use super::calibrate::{Applied, BestAnswers, shipped_curve};
 use super::features::{Features, GlobalKind};
-use super::measure::{self, Judged, PoseAccuracy, RECALL_AT};
+use super::measure::{self, Interval, Judged, PoseAccuracy, RECALL_AT};
 use super::run::Answer;
 use super::summary::{
     AtK, Both, Bytes, CalibrationSummary, GroupSummary, Outcome, RankedBy, RunConfig, Seconds,
@@ -36,25 +36,10 @@ pub fn summarise(
         reranked: config.rerank.is_some(),
     };
     let all: Vec<&Answer> = answers.iter().collect();
-    let judged: Vec<&Answer> = all
-        .iter()
-        .copied()
-        .filter(|a| dataset.truth[a.query] != Truth::Unknown)
-        .collect();
+    let judged = view.of_known_truth(&all);
     let with_match = view.with_match(&all);
     let best = BestAnswers::of(dataset, answers, left_out);
-    let mut unreadable = database.unreadable.clone();
-    unreadable.extend(queries.unreadable.iter().cloned());
-    let bytes = Bytes {
-        global: 4.0 * database.dim as f64,
-        pooled: 2.0 * database.pooled_dim as f64,
-        patches: database.patch_bytes,
-    };
-    let interval = |by| {
-        let hits = view.hits(&with_match, by);
-        let intervals = measure::bootstrap_recall(&hits, &RECALL_AT, config.bootstrap, config.seed);
-        RECALL_AT.into_iter().zip(intervals).collect()
-    };
+    let bytes = bytes_of(database);
     Summary {
         dataset: dataset.name.clone(),
         queries: answers.len(),
@@ -63,7 +48,9 @@ pub fn summarise(
         queries_left_out: left_out.len(),
         database: dataset.database.len() - database.unreadable.len(),
         recall: Both::of(view.reranked, |by| view.recall(&with_match, by)),
-        recall_interval: Both::of(view.reranked, interval),
+        recall_interval: Both::of(view.reranked, |by| {
+            view.recall_intervals(&with_match, by, &config)
+        }),
         map: Both::of(view.reranked, |by| {
             view.mean_average_precision(&with_match, by)
         }),
@@ -74,8 +61,7 @@ pub fn summarise(
         groups: view.groups(&all),
         calibration: fitted_here(&best, config.seed),
         shipped_calibration: shipped_here(&best, &config),
-        given_calibration: given
-            .and_then(|given| given_here(&best, given, config.rerank.is_some())),
+        given_calibration: given.and_then(|given| given_here(&best, given, view.reranked)),
         seconds: Seconds {
             decode: database.seconds.decode,
             extract: database.seconds.extract,
@@ -87,9 +73,18 @@ pub fn summarise(
         bytes,
         config,
         outcomes: answers.iter().map(|answer| view.outcome(answer)).collect(),
-        unreadable,
+        unreadable: [&database.unreadable[..], &queries.unreadable[..]].concat(),
         skipped: dataset.skipped.clone(),
         notes: dataset.notes.clone(),
+    }
+}
+
+/// Bytes of one reference at rest: f32 global values, f16 pooled ones.
+fn bytes_of(database: &Features) -> Bytes {
+    Bytes {
+        global: 4.0 * database.dim as f64,
+        pooled: 2.0 * database.pooled_dim as f64,
+        patches: database.patch_bytes,
     }
 }
 
@@ -119,6 +114,11 @@ impl<'a> View<'a> {
             .collect()
     }
 
+    fn of_known_truth<'b>(&self, answers: &[&'b Answer]) -> Vec<&'b Answer> {
+        let is_known = |answer: &&Answer| self.dataset.truth[answer.query] != Truth::Unknown;
+        answers.iter().copied().filter(is_known).collect()
+    }
+
     fn hits(&self, with_match: &[&Answer], by: RankedBy) -> Vec<Option<usize>> {
         with_match
             .iter()
@@ -132,6 +132,17 @@ impl<'a> View<'a> {
             .into_iter()
             .map(|k| (k, measure::recall_at(&hits, k)))
             .collect()
+    }
+
+    fn recall_intervals(
+        &self,
+        with_match: &[&Answer],
+        by: RankedBy,
+        config: &RunConfig,
+    ) -> AtK<Interval> {
+        let hits = self.hits(with_match, by);
+        let intervals = measure::bootstrap_recall(&hits, &RECALL_AT, config.bootstrap, config.seed);
+        RECALL_AT.into_iter().zip(intervals).collect()
     }
 
     fn mean_average_precision(&self, with_match: &[&Answer], by: RankedBy) -> AtK<f64> {

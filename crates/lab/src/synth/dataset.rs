@@ -200,7 +200,8 @@ fn shot(
     viewpoint: Viewpoint,
     capture: Capture,
 ) -> Shot {
-    let (location, heading) = (world.position(place, viewpoint), world.heading(viewpoint));
+    let location = world.position(place, viewpoint);
+    let heading = world.heading(viewpoint);
     let hour = if capture.condition == Condition::Dusk {
         10
     } else {
@@ -232,7 +233,8 @@ fn shot(
     }
 }
 
-/// `@utm_east@utm_north@zone@band@lat@lon@panorama@tile@heading@pitch@roll@height@timestamp@note@.jpg`.
+/// The name of an image in the layout of the field: `@utm_east@utm_north@zone@band@lat@lon`, then
+/// `@panorama@tile@heading@pitch@roll@height@timestamp@note@.jpg`.
 fn file_name(
     location: GeoPoint,
     heading: Heading,
@@ -240,14 +242,16 @@ fn file_name(
     id: &str,
     condition: Condition,
 ) -> String {
-    let (lat, lon) = (location.lat(), location.lon());
+    let lat = location.lat();
+    let lon = location.lon();
     let (north, east, _) = utm::to_utm_wgs84_no_zone(lat, lon);
     let zone = utm::lat_lon_to_zone_number(lat, lon);
     let band = utm::lat_to_zone_letter(lat).unwrap_or('X');
     let stamp = format!("{:04}{:02}{:02}", at.year(), u8::from(at.month()), at.day());
     let heading = heading.degrees();
     format!(
-        "@{east:.2}@{north:.2}@{zone}@{band}@{lat:.6}@{lon:.6}@{id}@@{heading:.1}@@@@{stamp}@{condition}@.jpg"
+        "@{east:.2}@{north:.2}@{zone}@{band}@{lat:.6}@{lon:.6}\
+         @{id}@@{heading:.1}@@@@{stamp}@{condition}@.jpg"
     )
 }
 

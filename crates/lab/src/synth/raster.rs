@@ -303,7 +303,8 @@ impl PixelToQuad {
         if mapped.z <= 0.0 || mapped.z > 1.0 / NEAR_M {
             return None;
         }
-        let (u, v) = (mapped.x / mapped.z, mapped.y / mapped.z);
+        let u = mapped.x / mapped.z;
+        let v = mapped.y / mapped.z;
         ((0.0..=1.0).contains(&u) && (0.0..=1.0).contains(&v)).then_some((u, v, mapped.z))
     }
 
@@ -315,8 +316,10 @@ impl PixelToQuad {
             let dv = (per.y - v * per.z) / inverse_depth * size[1];
             du.hypot(dv)
         };
-        let (a, b) = (step(self.per_x), step(self.per_y));
-        let (long, short) = (a.max(b), a.min(b));
+        let a = step(self.per_x);
+        let b = step(self.per_y);
+        let long = a.max(b);
+        let short = a.min(b);
         // long^(3/4) * short^(1/4)
         (long * (long * short).sqrt()).sqrt().max(1e-3)
     }

@@ -100,7 +100,8 @@ impl StreetWorld {
         let horizon = seed_of(&[self.seed, place / PLACES_PER_STREET, 0x5c7]);
         for at in 0..frame.light.len() {
             if frame.depth(at).is_infinite() {
-                let (x, y) = (at % camera.width, at / camera.width);
+                let x = at % camera.width;
+                let y = at / camera.width;
                 let ray = camera.ray(x as f32 + 0.5, y as f32 + 0.5);
                 frame.light[at] = light
                     .distance(ray, horizon)
@@ -154,7 +155,8 @@ impl StreetWorld {
         let across = (viewpoint.across_m as f32).clamp(-lane, lane);
         let position = Vec3::new(along as f32, 1.65 + shake.real(-0.12..0.12), across);
         let yaw = (viewpoint.turn_deg as f32).to_radians();
-        let (pitch, roll) = (0.11 + shake.real(-0.03..0.03), shake.real(-0.02..0.02));
+        let pitch = 0.11 + shake.real(-0.03..0.03);
+        let roll = shake.real(-0.02..0.02);
         // Twice the size, for antialiasing.
         Camera::new(
             position,

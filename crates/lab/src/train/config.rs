@@ -47,6 +47,9 @@ impl Default for TrainConfig {
 
 impl TrainConfig {
     /// Refuses settings that are out of range.
+    ///
+    /// # Errors
+    /// A setting is out of range.
     pub fn check(&self) -> Result<(), TrainError> {
         self.schedule.check()?;
         self.augmentation.check()?;

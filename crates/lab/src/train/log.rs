@@ -73,6 +73,9 @@ impl TrainLog {
 }
 
 /// Every cycle of the run in `folder`; a last line cut off by a kill is passed over.
+///
+/// # Errors
+/// The file cannot be read, or a line of it is no record.
 pub fn read_log(folder: &Path) -> Result<Vec<CycleRecord>, TrainError> {
     let path = folder.join(FILE);
     let io = |source| TrainError::Io {

@@ -2,8 +2,9 @@
 //!
 //! ```text
 //! data set --triplets--> positives within 10 m, the rest beyond 25 m
-//!    cycle: draw the queries, embed them, their positives and a pool --mining--> hardest negatives of each query
-//!           N steps of triplets --loss--> --adam--> weights      (learning rate by schedule)
+//!    cycle: draw the queries; embed them, their positives and a pool
+//!           --mining--> the hardest negatives of each query
+//!           N steps of triplets --loss--> --adam--> weights  (learning rate by schedule)
 //!           validation recall --> best weights kept, stop when it no longer improves
 //!           checkpoint (weights, moments, counters), log line
 //! ```

@@ -86,7 +86,8 @@ impl Sources {
             sets.push(set);
         }
         if !self.drives.is_empty() {
-            let (positive, negative) = (rule.positive_frames, rule.negative_frames);
+            let positive = rule.positive_frames;
+            let negative = rule.negative_frames;
             sets.push(TripletSet::by_order(&self.drives, positive, negative)?);
         }
         TripletSet::merge(sets)

@@ -89,16 +89,14 @@ fn name_at(zone: UtmZone, lat: f64, lon: f64, north: f64) -> String {
 #[test]
 fn far_zones_keep_their_metres_and_never_meet() {
     let root = tempfile::tempdir().unwrap();
-    let (copenhagen, francisco) = (
-        UtmZone {
-            number: 33,
-            band: 'U',
-        },
-        UtmZone {
-            number: 10,
-            band: 'S',
-        },
-    );
+    let copenhagen = UtmZone {
+        number: 33,
+        band: 'U',
+    };
+    let francisco = UtmZone {
+        number: 10,
+        band: 'S',
+    };
     let names = [
         format!(
             "images/val/database/{}",
@@ -131,10 +129,8 @@ fn far_zones_keep_their_metres_and_never_meet() {
     for (query, truth) in dataset.queries.iter().zip(&dataset.truth) {
         let expected: Vec<usize> = (0..2)
             .filter(|&index| {
-                let (a, b) = (
-                    dataset.database[index].position.unwrap(),
-                    query.position.unwrap(),
-                );
+                let a = dataset.database[index].position.unwrap();
+                let b = query.position.unwrap();
                 let same = dataset.database[index].group == query.group;
                 same && (a.east - b.east).hypot(a.north - b.north) < 25.0
             })

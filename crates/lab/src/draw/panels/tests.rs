@@ -10,7 +10,9 @@ fn patches(index: Vec<u16>, counts: [usize; 3]) -> PackedPatches {
         patch_px: 14,
         stride: PoolingStride::Kernel,
     };
-    let (attention, factor, codes) = (vec![f16::ONE; n], vec![1.0; n], vec![1; n]);
+    let attention = vec![f16::ONE; n];
+    let factor = vec![1.0; n];
+    let codes = vec![1; n];
     PackedPatches {
         grid,
         dim: 1,
@@ -34,8 +36,9 @@ fn grey() -> RgbImage {
 
 #[test]
 fn rows_and_panels_add_up_and_lines_join_the_patches() {
-    let (image, patches) = (grey(), patches(vec![32 * 12 + 16, 0], [1, 1, 0]));
-    let side = MatchSide {
+    let image = grey();
+    let patches = patches(vec![32 * 12 + 16, 0], [1, 1, 0]);
+    let side = DrawnSide {
         image: &image,
         attention: None,
         patches: &patches,
@@ -56,7 +59,9 @@ fn rows_and_panels_add_up_and_lines_join_the_patches() {
     );
     // The patch lies at 231, 175 of 448 x 336, so at 247.5, 187.5 of a panel of 480 x 360.
     let top = 8 + 360 + 8 + 24;
-    let (left_x, right_x, y) = (8 + 247, 16 + 480 + 247, top + 187);
+    let left_x = 8 + 247;
+    let right_x = 16 + 480 + 247;
+    let y = top + 187;
     assert_eq!(picture.pixel(left_x, y), [94, 231, 138]);
     assert_eq!(picture.pixel(right_x, y), [94, 231, 138]);
     let between = picture.pixel((left_x + right_x) / 2, y);
@@ -67,8 +72,9 @@ fn rows_and_panels_add_up_and_lines_join_the_patches() {
 
 #[test]
 fn key_patches_are_outlined_in_the_colour_of_their_scale() {
-    let (image, patches) = (grey(), patches(vec![0, 15], [0, 1, 1]));
-    let side = MatchSide {
+    let image = grey();
+    let patches = patches(vec![0, 15], [0, 1, 1]);
+    let side = DrawnSide {
         image: &image,
         attention: None,
         patches: &patches,
@@ -94,13 +100,15 @@ fn heat_is_where_the_attention_is() {
         },
     )
     .unwrap();
-    let (hot, cold) = (picture.pixel(240, 240), picture.pixel(600, 440));
+    let hot = picture.pixel(240, 240);
+    let cold = picture.pixel(600, 440);
     assert!(hot[0] > cold[0] + 60, "{hot:?} {cold:?}");
 }
 
 #[test]
 fn what_does_not_fit_is_refused() {
-    let (image, patches) = (grey(), patches(vec![0], [1, 0, 0]));
+    let image = grey();
+    let patches = patches(vec![0], [1, 0, 0]);
     let map = AttentionMap {
         values: &[1.0; 5],
         columns: 2,
@@ -110,7 +118,7 @@ fn what_does_not_fit_is_refused() {
         attention_picture(&image, map),
         Err(DrawError::AttentionShape { values: 5, .. })
     ));
-    let side = MatchSide {
+    let side = DrawnSide {
         image: &image,
         attention: None,
         patches: &patches,
@@ -129,7 +137,7 @@ fn what_does_not_fit_is_refused() {
         },
         pixels: vec![],
     };
-    let side = MatchSide {
+    let side = DrawnSide {
         image: &empty,
         ..side
     };

@@ -63,14 +63,13 @@ fn limits_cut_each_scale_for_itself() {
 #[test]
 fn coarse_codes_stay_within_half_a_step() {
     assert_eq!(coarsen(&patches(), 8), patches());
-    let (fine, coarse) = (patches(), coarsen(&patches(), 4));
+    let fine = patches();
+    let coarse = coarsen(&patches(), 4);
     for (row, (a, b)) in fine.codes.chunks(2).zip(coarse.codes.chunks(2)).enumerate() {
         assert!(b.iter().all(|code| code.abs() <= 7));
         for (a, b) in a.iter().zip(b) {
-            let (a, b) = (
-                f32::from(*a) * fine.factor[row],
-                f32::from(*b) * coarse.factor[row],
-            );
+            let a = f32::from(*a) * fine.factor[row];
+            let b = f32::from(*b) * coarse.factor[row];
             assert!((a - b).abs() <= coarse.factor[row] / 2.0 + 1e-5, "{a} {b}");
         }
     }
@@ -78,7 +77,8 @@ fn coarse_codes_stay_within_half_a_step() {
 
 #[test]
 fn each_axis_has_its_base_row_and_extractions_are_shared() {
-    let (extract, rerank) = (ExtractConfig::default(), RerankConfig::default());
+    let extract = ExtractConfig::default();
+    let rerank = RerankConfig::default();
     let base = Base {
         extract: &extract,
         rerank: &rerank,
@@ -290,7 +290,8 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
         skipped: vec![],
         notes: vec![],
     };
-    let (extract, rerank) = (ExtractConfig::default(), RerankConfig::default());
+    let extract = ExtractConfig::default();
+    let rerank = RerankConfig::default();
     let cache = folder.path().join("cache");
     let backbones = &[Preset::Dinov2Vits14];
     let base = Base {
@@ -377,7 +378,8 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
     // A codec of fewer bits or components is smaller; the base is the same on every axis.
     assert!(row("codec", "int4 simulated").patch_bytes < row("codec", "int8 *").patch_bytes);
     // Full precision recalls as much here, and is left out where it would not fit.
-    let (full, int8) = (row("codec", "f32"), row("codec", "int8 *"));
+    let full = row("codec", "f32");
+    let int8 = row("codec", "int8 *");
     assert_eq!(full.recall, int8.recall);
     assert!(full.patch_bytes > 2.0 * int8.patch_bytes);
     let small = ablate(

@@ -8,7 +8,8 @@ use placeformer_vision::rerank::PairScore;
 fn dataset(truth: Vec<Truth>, references: usize) -> Dataset {
     let items = |n: usize| (0..n).map(|i| Item::new(i.to_string(), "x")).collect();
     let queries = items(truth.len());
-    let (skipped, notes) = (Vec::new(), Vec::new());
+    let skipped = Vec::new();
+    let notes = Vec::new();
     Dataset {
         name: "d".into(),
         database: items(references),

@@ -2,7 +2,9 @@
 
 use super::*;
 use placeformer_core::progress::Silent;
-use placeformer_core::types::{ImageSize, PatchGrid, PoolingStride};
+use placeformer_core::types::{
+    Descriptor, ImageSize, KeyPatches, ModelId, PatchGrid, PoolingStride,
+};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Describes an image by its first byte; refuses those that start with `!`.

@@ -43,7 +43,8 @@ pub fn fit(answers: &[TopOne], ridge: f64) -> Result<ConfidenceWeights, Calibrat
     loop {
         let used = Vector3::new(1.0, use_score, use_distance);
         let weights = maximum_likelihood(answers, ridge, used);
-        let (score, distance) = (weights[1], weights[2]);
+        let score = weights[1];
+        let distance = weights[2];
         if score < 0.0 {
             use_score = 0.0;
         } else if distance > 0.0 {

@@ -1,4 +1,5 @@
-//! Dealing answers to the folds of a cross-validation: places stay whole, folds come out alike.
+//! Divides answers into the folds of a cross-validation, so that the answers of a place are in one
+//! fold, and folds have about as many right and wrong answers as each other.
 
 use super::answers::TopOne;
 use rand::SeedableRng;

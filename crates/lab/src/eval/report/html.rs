@@ -57,33 +57,7 @@ pub fn table(caption: &str, headers: &[&str], rows: &[Vec<impl Render>]) -> Mark
     }
 }
 
-const STYLE: &str = "
-:root{--bg:#fff;--fg:#1c2024;--soft:#5b6570;--rule:#d9dee3;--panel:#f5f7f9;--a:#0b62c4;--b:#c2410c;--c:#15803d}
-@media (prefers-color-scheme:dark){:root{--bg:#14171a;--fg:#e8ebee;--soft:#9aa5b1;--rule:#333a41;--panel:#1d2125;
---a:#6cb0ff;--b:#ff9a62;--c:#5fd08a}}
-*{box-sizing:border-box}body{margin:0;background:var(--bg);color:var(--fg);font:16px/1.5 system-ui,sans-serif}
-main{max-width:1120px;margin:0 auto;padding:24px 20px 64px}h1{font-size:1.6rem;margin:0 0 4px}
-h2{font-size:1.2rem;margin:40px 0 8px}h3{font-size:1rem;margin:20px 0 6px}p{max-width:72ch}
-.lead,.soft,caption,figcaption{color:var(--soft)}.scroll{overflow-x:auto}
-table{border-collapse:collapse;margin:12px 0;font-variant-numeric:tabular-nums}
-caption{text-align:left;padding:4px 0;font-size:.9rem}th,td{padding:5px 14px 5px 0;text-align:right;
-border-bottom:1px solid var(--rule);white-space:nowrap}th[scope=row],thead th:first-child{text-align:left}
-thead th{font-weight:600}tbody th{font-weight:400}
-.plots{display:grid;grid-template-columns:repeat(auto-fit,minmax(330px,1fr));gap:16px}
-figure{margin:0;background:var(--panel);border-radius:8px;padding:12px}figcaption{font-size:.9rem}
-svg.plot{width:100%;height:auto;display:block}svg text{font:12px system-ui,sans-serif;fill:var(--soft)}
-svg .label,svg .legend{fill:var(--fg)}svg .grid{stroke:var(--rule)}svg .axis{stroke:var(--soft)}
-svg .line{fill:none;stroke-width:2.2}svg .line.a{stroke:var(--a)}svg .line.b{stroke:var(--b)}svg .line.c{stroke:var(--c)}
-svg .line.muted{stroke:var(--soft);stroke-dasharray:4 4;stroke-width:1.2}
-svg .dot.a,svg .key.a,svg .bar.a{fill:var(--a)}svg .dot.b,svg .key.b,svg .bar.b{fill:var(--b)}
-svg .dot.c,svg .key.c,svg .bar.c{fill:var(--c)}svg .key.muted{fill:var(--soft)}svg .bar{fill-opacity:.62}
-details{border:1px solid var(--rule);border-radius:8px;margin:12px 0;padding:0 14px}summary{cursor:pointer;padding:10px 0;
-font-weight:600}details[open]{padding-bottom:14px}img{max-width:100%;height:auto;border-radius:4px;display:block}
-.row{display:grid;grid-template-columns:repeat(auto-fill,minmax(200px,1fr));gap:10px;margin:8px 0}
-.row figure{padding:6px}.right{outline:3px solid var(--c)}.wrong{outline:3px solid var(--b)}
-code,pre{font:13px/1.45 ui-monospace,monospace}pre{background:var(--panel);padding:12px;border-radius:8px;overflow:auto}
-ul.names{columns:2;font-size:.9rem}@media print{details{break-inside:avoid}}
-";
+const STYLE: &str = include_str!("style.css");
 
 #[cfg(test)]
 mod tests {

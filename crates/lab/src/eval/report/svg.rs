@@ -165,7 +165,8 @@ impl Canvas {
     fn new(title: &str, x_range: (f64, f64), y_range: (f64, f64)) -> Self {
         let title = escaped(title);
         let svg = format!(
-            "<svg class=\"plot\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{title}\"><title>{title}</title>"
+            "<svg class=\"plot\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" \
+             aria-label=\"{title}\"><title>{title}</title>"
         );
         Self {
             svg,
@@ -206,7 +207,8 @@ impl Canvas {
             let _ = write!(
                 self.svg,
                 "<line class=\"grid\" x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{bottom}\" y2=\"{:.1}\"/>\
-                 <text class=\"tick\" x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{label}</text>",
+                 <text class=\"tick\" x=\"{x:.1}\" y=\"{:.1}\" \
+                 text-anchor=\"middle\">{label}</text>",
                 bottom + 4.0,
                 bottom + 17.0
             );
@@ -215,7 +217,8 @@ impl Canvas {
             self.svg,
             "<line class=\"axis\" x1=\"{LEFT}\" x2=\"{right}\" y1=\"{bottom}\" y2=\"{bottom}\"/>\
              <text class=\"label\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>\
-             <text class=\"label\" transform=\"translate(13 {:.1}) rotate(-90)\" text-anchor=\"middle\">{}</text>",
+             <text class=\"label\" transform=\"translate(13 {:.1}) rotate(-90)\" \
+             text-anchor=\"middle\">{}</text>",
             (LEFT + right) / 2.0,
             HEIGHT - 10.0,
             escaped(x_label),
@@ -240,7 +243,8 @@ impl Canvas {
             for &(x, y) in &series.points {
                 let _ = write!(
                     self.svg,
-                    "<circle class=\"dot {}\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"3.5\"><title>{}: {}</title></circle>",
+                    "<circle class=\"dot {}\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"3.5\">\
+                     <title>{}: {}</title></circle>",
                     series.class,
                     self.x(x),
                     self.y(y),
@@ -258,7 +262,8 @@ impl Canvas {
         let bottom = self.y(0.0);
         let _ = write!(
             self.svg,
-            "<rect class=\"bar {class}\" x=\"{:.1}\" y=\"{top:.1}\" width=\"{:.1}\" height=\"{:.1}\">\
+            "<rect class=\"bar {class}\" x=\"{:.1}\" y=\"{top:.1}\" \
+             width=\"{:.1}\" height=\"{:.1}\">\
              <title>{} to {}: {}</title></rect>",
             left + 0.5,
             (right - left - 1.0).max(0.5),
@@ -319,7 +324,8 @@ mod tests {
             points: vec![(0.0, 0.0), (10.0, 100.0)],
             dots: true,
         };
-        let (x_label, y_label) = ("k".into(), "%".into());
+        let x_label = "k".into();
+        let y_label = "%".into();
         let chart = LineChart {
             title: "t \"q\"".into(),
             x_label,

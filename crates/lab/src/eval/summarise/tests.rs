@@ -82,7 +82,8 @@ fn a_run_by_hand() {
         left_out: Vec::new(),
         seconds,
     };
-    let (database, queries) = (features(3, 2.0), features(4, 9.0));
+    let database = features(3, 2.0);
+    let queries = features(4, 9.0);
     let summary = summarise(&dataset, &database, &queries, &asked, config.clone(), None);
     assert_eq!(
         (

@@ -2,10 +2,8 @@ use super::super::paint::Painting;
 use super::*;
 
 fn upright(left: Vec3, right: Vec3, height: f32, texture: Arc<Texture>) -> Quad {
-    let (origin, down) = (
-        left + Vec3::new(0.0, height, 0.0),
-        Vec3::new(0.0, -height, 0.0),
-    );
+    let origin = left + Vec3::new(0.0, height, 0.0);
+    let down = Vec3::new(0.0, -height, 0.0);
     Quad {
         origin,
         across: right - left,
@@ -41,7 +39,8 @@ fn project(camera: &Camera, point: Vec3) -> [f32; 2] {
 
 #[test]
 fn pixels_map_back_to_the_points_projected_on_them() {
-    let (quad, camera) = (quad(), camera());
+    let quad = quad();
+    let camera = camera();
     let map = PixelToQuad::new(&camera, &quad).unwrap();
     for (u, v) in [(0.01, 0.01), (0.5, 0.5), (0.9, 0.2), (0.3, 0.99)] {
         let point = quad.origin + quad.across * u + quad.down * v;
@@ -54,7 +53,8 @@ fn pixels_map_back_to_the_points_projected_on_them() {
 
 #[test]
 fn what_is_drawn_lies_where_it_projects_and_the_nearer_wins() {
-    let (far, camera) = (quad(), camera());
+    let far = quad();
+    let camera = camera();
     let mut wall = Painting::new(1.0, 1.0, 8.0);
     wall.rect(0.0, 0.0, 1.0, 1.0, [255, 255, 255]);
     let near = upright(

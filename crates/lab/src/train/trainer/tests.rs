@@ -100,7 +100,8 @@ fn eight_places_are_learnt_to_zero_loss() {
 #[test]
 fn an_interrupted_run_continues_bit_for_bit() {
     let (set, tokens) = eight_places();
-    let (whole, broken) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let whole = tempfile::tempdir().unwrap();
+    let broken = tempfile::tempdir().unwrap();
     let config = config(100);
     let straight = head(&tokens);
     let expected = train_in(whole.path(), &straight, &set, &config, u64::MAX).unwrap();
@@ -258,7 +259,8 @@ fn a_cycle_costs_its_queries_their_positives_and_the_pool_however_large_the_data
             .map(|i| PathBuf::from(format!("{side}{i}")))
             .collect()
     };
-    let (asking, answering) = (3000usize, 9000usize);
+    let asking = 3000usize;
+    let answering = 9000usize;
     let positives: Vec<Vec<u32>> = (0..asking as u32)
         .map(|query| vec![3 * query, 3 * query + 1])
         .collect();
@@ -294,7 +296,8 @@ fn a_cycle_costs_its_queries_their_positives_and_the_pool_however_large_the_data
     // All descriptors coincide, so every triplet costs the margin.
     assert!((f64::from(loss) - config.margin).abs() < 1e-6, "{loss}");
     assert_eq!(shown, [0, 40, 41, 42, 43, 44, 45]);
-    let (asked, trained) = (5 * 4, 5 * 3 * 4);
+    let asked = 5 * 4;
+    let trained = 5 * 3 * 4;
     let described = model.described.borrow().len();
     assert_eq!(described, announced + trained);
     assert!(
