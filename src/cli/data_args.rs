@@ -1,5 +1,6 @@
 //! Flags that say how data sets are read, for the subcommands that read them.
 
+use super::choice::choice;
 use placeformer_lab::datasets::{DatasetOptions, Split};
 
 /// What is taken of a data set in the layout in which it is distributed.
@@ -7,7 +8,7 @@ use placeformer_lab::datasets::{DatasetOptions, Split};
 pub struct ReadArgs {
     /// Part of the data set [default: train for training; for evaluation test, val for MSLS, train
     /// for RobotCar, whose test poses are withheld].
-    #[arg(long, value_enum)]
+    #[arg(long, value_parser = choice::<Split>())]
     pub split: Option<Split>,
     /// Only these cities (MSLS).
     #[arg(long, value_delimiter = ',', value_name = "CITY,...")]

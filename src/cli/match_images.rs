@@ -62,7 +62,8 @@ pub fn run(args: MatchArgs) -> anyhow::Result<()> {
         Seen::new(&extractor, &limits, &bytes)
             .with_context(|| format!("cannot use {}", path.display()))
     };
-    let (query, reference) = (see(&args.query)?, see(&args.reference)?);
+    let query = see(&args.query)?;
+    let reference = see(&args.reference)?;
     let reranker = Reranker::new(rerank);
     let matches = reranker.explain(&query.patches, &reference.patches);
     if args.json {
@@ -148,7 +149,8 @@ fn as_json(query: &Seen, reference: &Seen, matches: &[CombinationMatch]) -> Valu
     };
     let combination = |found: &CombinationMatch| {
         let pair = |pair: &placeformer_vision::rerank::Correspondence| {
-            let (from, to) = (pair.query as usize, pair.reference as usize);
+            let from = pair.query as usize;
+            let to = pair.reference as usize;
             json!({
                 "query": query.patches.centre(from),
                 "reference": reference.patches.centre(to),

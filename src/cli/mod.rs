@@ -1,18 +1,29 @@
 //! The command line: one file per subcommand.
+//!
+//! Without the feature `lab` there are only the commands that run, fill and inspect a server.
 
 pub mod backup;
+#[cfg(feature = "lab")]
 pub mod bench;
+#[cfg(feature = "lab")]
 mod child_server;
+#[cfg(feature = "lab")]
+mod choice;
 mod client;
+#[cfg(feature = "lab")]
 mod data_args;
+#[cfg(feature = "lab")]
 pub mod demo;
+#[cfg(feature = "lab")]
 pub mod eval;
 pub mod extract;
+#[cfg(feature = "lab")]
 pub mod head;
 pub mod healthcheck;
 pub mod import;
 pub mod load;
 pub mod map;
+#[cfg(feature = "lab")]
 pub mod match_images;
 pub mod model;
 pub mod model_args;
@@ -21,7 +32,9 @@ pub mod output;
 mod progress;
 pub mod query;
 pub mod serve;
+#[cfg(feature = "lab")]
 pub mod synth;
+#[cfg(feature = "lab")]
 pub mod train;
 pub mod verify;
 
@@ -47,14 +60,17 @@ pub enum Command {
     /// Ask which place a photo shows.
     Query(query::QueryArgs),
     /// Match two images and draw the evidence.
+    #[cfg(feature = "lab")]
     Match(match_images::MatchArgs),
     /// Show every intermediate of extraction.
     Extract(extract::ExtractArgs),
     /// Obtain and inspect models.
     Model(model::ModelArgs),
     /// Fit or train the projection to the global descriptor.
+    #[cfg(feature = "lab")]
     Head(head::HeadArgs),
     /// Measure recall on a data set.
+    #[cfg(feature = "lab")]
     Eval(eval::EvalArgs),
     /// Train the model: its head, or blocks of the backbone too.
     ///
@@ -71,12 +87,16 @@ pub enum Command {
     ///
     /// With --head none the head starts as a half-whitened PCA of the training images (more than
     /// 256 of them).
+    #[cfg(feature = "lab")]
     Train(train::TrainArgs),
     /// Render synthetic street scenes.
+    #[cfg(feature = "lab")]
     Synth(synth::SynthArgs),
     /// Serve a demo map, query it, write a report.
+    #[cfg(feature = "lab")]
     Demo(demo::DemoArgs),
     /// Measure every stage beside its baselines.
+    #[cfg(feature = "lab")]
     Bench(bench::BenchArgs),
     /// Drive a server at a constant rate.
     Load(load::LoadArgs),
@@ -103,14 +123,21 @@ impl Cli {
             Command::Serve(args) => serve::run(args),
             Command::Import(args) => import::run(args),
             Command::Query(args) => query::run(args),
+            #[cfg(feature = "lab")]
             Command::Match(args) => match_images::run(args),
             Command::Extract(args) => extract::run(args),
             Command::Model(args) => model::run(args),
+            #[cfg(feature = "lab")]
             Command::Head(args) => head::run(args),
+            #[cfg(feature = "lab")]
             Command::Eval(args) => eval::run(args),
+            #[cfg(feature = "lab")]
             Command::Train(args) => train::run(args),
+            #[cfg(feature = "lab")]
             Command::Synth(args) => synth::run(args),
+            #[cfg(feature = "lab")]
             Command::Demo(args) => demo::run(args),
+            #[cfg(feature = "lab")]
             Command::Bench(args) => bench::run(args),
             Command::Load(args) => load::run(args),
             Command::Verify(args) => verify::run(args),

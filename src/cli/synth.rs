@@ -1,9 +1,9 @@
 //! Render synthetic street scenes.
 
 use crate::cli::output::say;
-use indicatif::{ProgressBar, ProgressStyle};
+use crate::cli::progress::ProgressBars;
 use placeformer_core::types::ImageSize;
-use placeformer_lab::synth::{Condition, DatasetOptions, image_count, write_dataset};
+use placeformer_lab::synth::{Condition, TownOptions, write_town};
 use std::path::PathBuf;
 
 /// Arguments of this subcommand.
@@ -43,19 +43,14 @@ fn parse_size(text: &str) -> Result<ImageSize, String> {
 
 /// Runs it.
 pub fn run(args: SynthArgs) -> anyhow::Result<()> {
-    let options = DatasetOptions {
+    let options = TownOptions {
         places: args.places,
         views: args.views,
         seed: args.seed,
         size: args.size,
         conditions: args.conditions,
     };
-    let bar = ProgressBar::new(image_count(&options));
-    bar.set_style(ProgressStyle::with_template(
-        "rendering {wide_bar} {pos}/{len} images, {eta} left",
-    )?);
-    let summary = write_dataset(&args.out, &options, || bar.inc(1))?;
-    bar.finish_and_clear();
+    let summary = write_town(&args.out, &options, &ProgressBars::default())?;
     say!(
         "{}: {} references of {} places, {} queries ({} of places that are not mapped)",
         args.out.display(),

@@ -1,5 +1,6 @@
 //! What `eval`, `import` and `match` say to wrong arguments, before any model is loaded; and `eval`
 //! from photos to figures, files and pages, on a small drawn town.
+#![cfg(feature = "lab")]
 
 use crate::common::program::{
     self, SIZE, has_model, offline, prints, refused_by, succeeds, town, words,

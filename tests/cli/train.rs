@@ -1,4 +1,5 @@
 //! `train`, `head train`, `head fit` and `map rehead` from flags to files, on a small drawn town.
+#![cfg(feature = "lab")]
 
 use crate::common::program::{SIZE, command, has_model, refusal, succeeds, town, words};
 use placeformer_store::{ReadPlaces, SqliteStore, StoreConfig};

@@ -1,5 +1,6 @@
 //! In the steady state, the stages of a query allocate their answers and little else: buffers are
 //! kept, matrices of similarities and scores never exist.
+#![cfg(feature = "lab")]
 
 use crate::common::weights::made_up;
 use placeformer_core::types::{ImageSize, ImageTensor, ReferenceFilter};

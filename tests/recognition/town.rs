@@ -1,5 +1,6 @@
 //! From photos to places with the real model: a town is imported into a server and recognised
 //! again.
+#![cfg(feature = "lab")]
 
 use crate::common::program::{Server, command, has_model, succeeds};
 use serde_json::Value;

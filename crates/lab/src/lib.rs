@@ -8,8 +8,10 @@
 //! | [`synth`] | the street renderer behind the demo map |
 //! | [`draw`] | pictures of matches |
 //! | [`mod@bench`] | every stage beside a plain implementation and the machine's limit |
+//! | [`choice`] | what callers parse from a name |
 
 pub mod bench;
+pub mod choice;
 pub mod datasets;
 pub mod draw;
 pub mod eval;

@@ -1,6 +1,6 @@
 //! `POST /query` through a server process, over loopback.
 
-use super::peers::{Measured, Peers};
+use super::peers::{Peers, QueryFigures};
 use crate::cli::child_server::ChildServer;
 use crate::cli::client::resident_bytes;
 use crate::cli::output::say;
@@ -12,7 +12,8 @@ use anyhow::{Context, ensure};
 use hdrhistogram::Histogram;
 use placeformer_core::types::ImageSize;
 use placeformer_lab::bench::filled::FilledStore;
-use placeformer_lab::bench::{fill_with_streets, scenes::street, street_map};
+use placeformer_lab::bench::scenes::street;
+use placeformer_lab::bench::{REFERENCE_SIZE, fill_with_streets, street_map};
 use placeformer_store::{SqliteStore, StoreConfig};
 use placeformer_vision::extract::{ExtractConfig, Extractor};
 use serde::Serialize;
@@ -51,10 +52,10 @@ pub(super) struct EndToEndRow {
     /// Clients that ask one query after the other.
     pub(super) clients: usize,
     #[serde(flatten)]
-    pub(super) ours: Measured,
+    pub(super) ours: QueryFigures,
     /// What users assemble today, with one client and no HTTP between.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) peer: Option<Measured>,
+    pub(super) peer: Option<QueryFigures>,
 }
 
 impl EndToEnd<'_> {
@@ -64,21 +65,17 @@ impl EndToEnd<'_> {
         let store = SqliteStore::open(&directory, &StoreConfig::default())?;
         fill_with_streets(&store, self.extractor, self.drawn)?;
         drop(store);
-        let photos: Vec<Vec<u8>> = (0..PHOTOS)
-            .map(|place| street(place * 7, 1, PHOTO_SIZE))
-            .collect::<Result<_, _>>()?;
-        let photos: Arc<[bytes::Bytes]> = photos.into_iter().map(bytes::Bytes::from).collect();
-        let prepare = |(python, weights)| {
-            let drawn = (self.drawn, placeformer_lab::bench::REFERENCE_SIZE);
-            Peers::prepare(
-                python,
-                self.folder,
-                (self.extractor, weights),
-                drawn,
-                &photos,
-            )
-        };
-        let peers = self.peers.map(prepare).transpose()?;
+        let mut photos = Vec::new();
+        for place in 0..PHOTOS {
+            photos.push(bytes::Bytes::from(street(place * 7, 1, PHOTO_SIZE)?));
+        }
+        let photos: Arc<[bytes::Bytes]> = photos.into();
+        let mut peers = None;
+        if let Some((python, weights)) = self.peers {
+            let model = (self.extractor, weights);
+            let drawn = (self.drawn, REFERENCE_SIZE);
+            peers = Some(Peers::prepare(python, self.folder, model, drawn, &photos)?);
+        }
         let runtime = tokio::runtime::Runtime::new()?;
         let mut rows: Vec<EndToEndRow> = Vec::new();
         for &references in self.references {
@@ -124,16 +121,11 @@ impl EndToEnd<'_> {
             let time = Duration::from_secs_f64(self.seconds);
             let (asked, resident) = runtime.block_on(async {
                 let asked = ask(&client, server.url(), photos, clients, time).await?;
-                let metrics = client
-                    .get(format!("{}/metrics", server.url()))
-                    .send()
-                    .await?
-                    .text()
-                    .await?;
-                anyhow::Ok((
-                    asked,
-                    resident_bytes(&metrics).context("the server does not tell its memory")?,
-                ))
+                let metrics = client.get(format!("{}/metrics", server.url())).send();
+                let metrics = metrics.await?.text().await?;
+                let resident = resident_bytes(&metrics);
+                let resident = resident.context("the server does not report its memory")?;
+                anyhow::Ok((asked, resident))
             })?;
             rows.push(asked.row(references, clients, resident));
         }
@@ -167,14 +159,14 @@ pub(super) fn serve_filled(
 }
 
 /// Answers of one measurement.
-struct Asked {
+struct ServerAnswers {
     latency: Histogram<u64>,
     stages: BTreeMap<String, Histogram<u64>>,
     /// From the first question to the last answer.
     elapsed: Duration,
 }
 
-impl Default for Asked {
+impl Default for ServerAnswers {
     fn default() -> Self {
         Self {
             latency: histogram(),
@@ -190,7 +182,7 @@ fn histogram() -> Histogram<u64> {
     Histogram::new(3).expect("constant digits are valid")
 }
 
-impl Asked {
+impl ServerAnswers {
     fn add(&mut self, latency: Duration, timings: &serde_json::Value) -> anyhow::Result<()> {
         self.latency.record(latency.as_micros() as u64)?;
         for (stage, ms) in timings.as_object().into_iter().flatten() {
@@ -207,7 +199,7 @@ impl Asked {
         let at = |histogram: &Histogram<u64>, quantile| {
             histogram.value_at_quantile(quantile) as f64 / 1e3
         };
-        let ours = Measured {
+        let ours = QueryFigures {
             queries: self.latency.len(),
             p50_ms: at(&self.latency, 0.5),
             p99_ms: at(&self.latency, 0.99),
@@ -236,19 +228,18 @@ async fn ask(
     photos: &Arc<[bytes::Bytes]>,
     clients: usize,
     time: Duration,
-) -> anyhow::Result<Asked> {
+) -> anyhow::Result<ServerAnswers> {
     let url = format!("{url}/query?map={}&deadline_ms=60000", street_map());
     for photo in photos.iter().take(2) {
         query(client, &url, photo.clone()).await?;
     }
-    let (asked, began) = (Arc::new(Mutex::new(Asked::default())), Instant::now());
+    let asked = Arc::new(Mutex::new(ServerAnswers::default()));
+    let began = Instant::now();
     let tasks = (0..clients).map(|number| {
-        let (client, url, photos, asked) = (
-            client.clone(),
-            url.clone(),
-            Arc::clone(photos),
-            Arc::clone(&asked),
-        );
+        let client = client.clone();
+        let url = url.clone();
+        let photos = Arc::clone(photos);
+        let asked = Arc::clone(&asked);
         tokio::spawn(async move {
             for photo in photos.iter().cycle().skip(number * 5) {
                 if began.elapsed() >= time {
@@ -267,7 +258,7 @@ async fn ask(
         task.await??;
     }
     let asked = std::mem::take(&mut *asked.lock().unwrap_or_else(PoisonError::into_inner));
-    Ok(Asked {
+    Ok(ServerAnswers {
         elapsed: began.elapsed(),
         ..asked
     })

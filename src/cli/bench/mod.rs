@@ -10,15 +10,14 @@ use crate::cli::output::say;
 use crate::cli::progress::ProgressBars;
 use anyhow::{Context, ensure};
 use end_to_end::{EndToEnd, EndToEndRow};
-use indicatif::{ProgressBar, ProgressStyle};
-use placeformer_lab::bench::{Bench, BenchError, Limits, NAMES, Row};
+use placeformer_core::progress::{Progress, Task};
+use placeformer_lab::bench::{Bench, BenchError, BenchRow, Limits, NAMES};
 use placeformer_models::resolve_weights;
 use placeformer_vision::extract::{ExtractError, Extractor, VitWeights};
 use serde::Serialize;
 use service::PipelineServices;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
 /// Arguments of this subcommand.
 #[derive(Debug, clap::Args)]
@@ -36,7 +35,12 @@ pub struct BenchArgs {
     #[arg(long)]
     end_to_end: bool,
     /// References of the map, with --end-to-end; random ones beyond the drawn.
-    #[arg(long, value_delimiter = ',', default_values_t = [1_000, 100_000, 1_000_000], requires = "end_to_end")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_values_t = [1_000, 100_000, 1_000_000],
+        requires = "end_to_end"
+    )]
     references: Vec<u64>,
     /// Drawn references with patches, with --end-to-end.
     #[arg(long, default_value_t = 1_000, requires = "end_to_end")]
@@ -72,7 +76,7 @@ struct Report {
     threads: usize,
     encoder: String,
     limits: Limits,
-    rows: Vec<Row>,
+    rows: Vec<BenchRow>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     end_to_end: Vec<EndToEndRow>,
 }
@@ -105,22 +109,13 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
     };
     say!("{}", table::machine(&report))?;
     if args.end_to_end {
-        let plan = EndToEnd {
-            references: &args.references,
-            drawn: args.drawn,
-            clients: &args.clients,
-            seconds: args.seconds,
-            extractor: &extractor,
-            folder: &folder,
-            peers: args.peers.as_deref().map(|python| (python, path.as_path())),
-        };
+        let plan = args.end_to_end_plan(&extractor, &folder, &path);
         report.end_to_end = plan.measure()?;
     } else {
-        let spec = config.encoder_spec()?;
         let bench = Bench {
             extractor,
             weights,
-            spec,
+            spec: config.encoder_spec()?,
             limits,
             folder,
             rounds: args.rounds as usize,
@@ -132,14 +127,34 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
         std::fs::write(path, serde_json::to_vec_pretty(&report)?)
             .with_context(|| format!("cannot write {}", path.display()))?;
     }
-    match args.end_to_end {
-        true => say!("{}", table::end_to_end(&report.end_to_end))?,
-        false => say!("{}", table::rows(&report.rows))?,
+    if args.end_to_end {
+        say!("{}", table::end_to_end(&report.end_to_end))?;
+    } else {
+        say!("{}", table::rows(&report.rows))?;
     }
     Ok(())
 }
 
-fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<Row>> {
+impl BenchArgs {
+    fn end_to_end_plan<'a>(
+        &'a self,
+        extractor: &'a Extractor,
+        folder: &'a Path,
+        weights: &'a Path,
+    ) -> EndToEnd<'a> {
+        EndToEnd {
+            references: &self.references,
+            drawn: self.drawn,
+            clients: &self.clients,
+            seconds: self.seconds,
+            extractor,
+            folder,
+            peers: self.peers.as_deref().map(|python| (python, weights)),
+        }
+    }
+}
+
+fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<BenchRow>> {
     for name in only {
         ensure!(
             NAMES.contains(&name.as_str()),
@@ -147,29 +162,26 @@ fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<Row>> {
             NAMES.join(", ")
         );
     }
-    let wanted = |name: &&str| {
-        only.iter().any(|wanted| wanted == name) || only.is_empty() && *name != "search_10m"
+    let wanted = |name: &&str| match only {
+        [] => *name != "search_10m",
+        only => only.iter().any(|wanted| wanted == name),
     };
     let names: Vec<&str> = NAMES.into_iter().filter(wanted).collect();
-    let bar = ProgressBar::new(names.len() as u64).with_style(ProgressStyle::with_template(
-        "{msg} [{bar:40}] {pos}/{len} {elapsed}",
-    )?);
-    bar.enable_steady_tick(Duration::from_millis(500));
+    let bars = ProgressBars::default();
+    let task = Task::begin(&bars, "measuring", names.len() as u64);
     let mut rows = Vec::new();
     for name in names {
-        bar.set_message(name.to_owned());
+        task.set_note(name);
         match bench.row(name) {
             Ok(row) => rows.push(row),
             // Named rows must be measured; of all rows, those this CPU can.
             Err(BenchError::Extract(error @ ExtractError::Precision { .. })) if only.is_empty() => {
-                // The bar's own `println` says nothing where there is no terminal.
-                bar.suspend(|| eprintln!("left out {name}: {error}"));
+                bars.suspend(&mut || eprintln!("left out {name}: {error}"));
             }
             Err(error) => return Err(error.into()),
         }
-        bar.inc(1);
+        task.add(1);
     }
-    bar.finish_and_clear();
     Ok(rows)
 }
 

@@ -14,7 +14,7 @@ const SCRIPT: &str = "benches/peers/pipeline.py";
 
 /// What one measurement gives, ours or the script's.
 #[derive(Debug, Serialize, Deserialize)]
-pub(super) struct Measured {
+pub(super) struct QueryFigures {
     /// Answers.
     pub(super) queries: u64,
     pub(super) p50_ms: f64,
@@ -79,7 +79,7 @@ impl<'a> Peers<'a> {
     }
 
     /// Runs the script for `seconds` at a map of `references`.
-    pub(super) fn measure(&self, references: u64, seconds: f64) -> anyhow::Result<Measured> {
+    pub(super) fn measure(&self, references: u64, seconds: f64) -> anyhow::Result<QueryFigures> {
         let output = Command::new(self.python)
             .arg(SCRIPT)
             .args(["--weights".as_ref(), self.weights.as_os_str()])

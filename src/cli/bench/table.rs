@@ -1,8 +1,8 @@
 //! Results as text.
 
-use super::peers::Measured;
+use super::peers::QueryFigures;
 use super::{EndToEndRow, Report};
-use placeformer_lab::bench::Row;
+use placeformer_lab::bench::BenchRow;
 use std::fmt::Write;
 
 /// What it ran on.
@@ -11,7 +11,8 @@ pub(super) fn machine(report: &Report) -> String {
     let optional =
         |value: Option<f64>| value.map_or("none".to_owned(), |value| format!("{value:.0}"));
     format!(
-        "{} threads at {}; at most {:.0} GFLOP/s f32, {} bf16, {} GOP/s int8; memory {:.1} GB/s; encoder {}",
+        "{} threads at {}; at most {:.0} GFLOP/s f32, {} bf16, {} GOP/s int8; memory {:.1} GB/s; \
+         encoder {}",
         report.threads,
         report.simd,
         limits.f32_gflops,
@@ -23,14 +24,14 @@ pub(super) fn machine(report: &Report) -> String {
 }
 
 /// One line per stage.
-pub(super) fn rows(rows: &[Row]) -> String {
+pub(super) fn rows(rows: &[BenchRow]) -> String {
     let mut text = format!(
         "{:<20} {:>10} {:>12} {:>7} {:>9}  baseline\n",
         "stage", "ours ms", "baseline ms", "ratio", "of limit"
     );
     for row in rows {
         let share = format!("{:.0}%", row.limit_share * 100.0);
-        // Cannot fail: writing to a String.
+        // Writing into a `String` cannot fail.
         let _ = writeln!(
             text,
             "{:<20} {:>10.3} {:>12.3} {:>6.2}x {:>9}  {}",
@@ -68,7 +69,7 @@ pub(super) fn end_to_end(rows: &[EndToEndRow]) -> String {
     text
 }
 
-fn measured(of: &Measured) -> String {
+fn measured(of: &QueryFigures) -> String {
     let stages: Vec<String> = of
         .stages_ms
         .iter()

@@ -52,47 +52,14 @@ pub struct DemoArgs {
 /// Runs it.
 pub fn run(args: DemoArgs) -> anyhow::Result<()> {
     let town = args.out.join("town");
+    let data = args.out.join("data");
     prepare(&args.out)?;
     resolve_weights(&ExtractConfig::default(), &ProgressBars::default())
         .context("the demo needs the default model")?;
 
-    say!(
-        "\n1. Draw a town of {} places, {} photos each",
-        args.places,
-        args.views
-    )?;
-    let (places, views, seed) = (
-        args.places.to_string(),
-        args.views.to_string(),
-        args.seed.to_string(),
-    );
-    let options = ["--places", &places, "--views", &views, "--seed", &seed];
-    placeformer(&[&["synth", "--out", text(&town)?], &options[..]].concat())?;
-
-    say!("\n2. Start the server")?;
-    let data = args.out.join("data");
-    say!(
-        "   $ placeformer serve --listen 127.0.0.1:0 --data {}",
-        data.display()
-    )?;
-    let arguments = ["serve", "--listen", "127.0.0.1:0", "--data"]
-        .map(OsString::from)
-        .into_iter();
-    let server = ChildServer::start(arguments.chain([data.into()]), args.out.join("server.log"))?;
-    say!("   ready at {}", server.url())?;
-
-    say!("\n3. Import the photos into the map {MAP:?}")?;
-    let started = Instant::now();
-    let database = town.join("database");
-    placeformer(&[
-        "import",
-        text(&database)?,
-        "--map",
-        MAP,
-        "--server",
-        server.url(),
-    ])?;
-    let import_seconds = started.elapsed().as_secs_f64();
+    draw_town(&args, &town)?;
+    let server = start_server(&data, &args.out)?;
+    let import_seconds = import(&town, &server)?;
 
     say!("\n4. Ask where each query photo was taken")?;
     let client = ServerClient::new(ServerArgs {
@@ -113,11 +80,55 @@ pub fn run(args: DemoArgs) -> anyhow::Result<()> {
 
     say!("\n{}", report::summary(&asked))?;
     say!("report: {}", path.display())?;
-    say!(
-        "ask more:  placeformer serve --data {}",
-        args.out.join("data").display()
-    )?;
+    say!("ask more:  placeformer serve --data {}", data.display())?;
     Ok(())
+}
+
+fn draw_town(args: &DemoArgs, town: &Path) -> anyhow::Result<()> {
+    say!(
+        "\n1. Draw a town of {} places, {} photos each",
+        args.places,
+        args.views
+    )?;
+    let places = args.places.to_string();
+    let views = args.views.to_string();
+    let seed = args.seed.to_string();
+    placeformer(&[
+        "synth",
+        "--out",
+        text(town)?,
+        "--places",
+        &places,
+        "--views",
+        &views,
+        "--seed",
+        &seed,
+    ])
+}
+
+fn start_server(data: &Path, out: &Path) -> anyhow::Result<ChildServer> {
+    say!("\n2. Start the server")?;
+    let arguments = ["serve", "--listen", "127.0.0.1:0", "--data"];
+    say!(
+        "   $ placeformer {} {}",
+        arguments.join(" "),
+        data.display()
+    )?;
+    let arguments = arguments.map(OsString::from).into_iter();
+    let arguments = arguments.chain([data.into()]);
+    let server = ChildServer::start(arguments, out.join("server.log"))?;
+    say!("   ready at {}", server.url())?;
+    Ok(server)
+}
+
+/// Imports the town's references; returns how many seconds that took.
+fn import(town: &Path, server: &ChildServer) -> anyhow::Result<f64> {
+    say!("\n3. Import the photos into the map {MAP:?}")?;
+    let started = Instant::now();
+    let database = town.join("database");
+    let database = text(&database)?;
+    placeformer(&["import", database, "--map", MAP, "--server", server.url()])?;
+    Ok(started.elapsed().as_secs_f64())
 }
 
 /// An empty folder: new, or left by an earlier demo.
@@ -221,10 +232,8 @@ fn picture(
         let query = &asked[index];
         let reference = &query.results[0].reference;
         let picture = out.join(format!("match-{}.png", evidence.len() + 1));
-        let (a, b) = (
-            town.join("queries").join(&query.query),
-            town.join("database").join(reference),
-        );
+        let a = town.join("queries").join(&query.query);
+        let b = town.join("database").join(reference);
         placeformer(&["match", text(&a)?, text(&b)?, "--out", text(&picture)?])?;
         evidence.push(Evidence {
             asked: index,

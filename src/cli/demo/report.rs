@@ -2,9 +2,10 @@
 
 use crate::cli::output::{OutputError, say};
 use anyhow::Context;
+use maud::{Markup, html};
 use placeformer_core::geography::UtmName;
 use placeformer_lab::draw::{jpeg_data_uri, thumbnail};
-use placeformer_lab::eval::report::{escape, page, table};
+use placeformer_lab::eval::report::{page, table};
 use placeformer_vision::image::{ImageConfig, decode};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
@@ -45,10 +46,8 @@ impl Asked {
         let found = |result: &Value| {
             let reference = result["external_id"].as_str()?.to_owned();
             let right = right.contains(&reference);
-            let (distance, score) = (
-                result["global_distance"].as_f64()?,
-                result["spatial_score"].as_u64()?,
-            );
+            let distance = result["global_distance"].as_f64()?;
+            let score = result["spatial_score"].as_u64()?;
             Some(Found {
                 reference,
                 distance,
@@ -173,12 +172,14 @@ pub(super) fn summary(asked: &[Asked]) -> String {
         .min();
     let highest_unmapped = unmapped.map(Asked::best_score).max();
     let mut text = format!(
-        "Right at rank 1: {globally} of {} by the global descriptor alone, {reranked} after re-ranking.",
+        "Right at rank 1: {globally} of {} by the global descriptor alone, \
+         {reranked} after re-ranking.",
         mapped.len()
     );
     if let (Some(lowest), Some(highest)) = (lowest_right, highest_unmapped) {
         text += &format!(
-            "\nPlaces that are not in the map score at most S = {highest}; right answers score at least {lowest}."
+            "\nPlaces that are not in the map score at most S = {highest}; \
+             right answers score at least {lowest}."
         );
     }
     let trusted: Vec<&Asked> = asked
@@ -205,44 +206,49 @@ pub(super) fn write(
     info: &Value,
     import_seconds: f64,
 ) -> anyhow::Result<()> {
-    let mut body = format!(
-        "<p class=\"lead\">{}</p>\n<p>Model <code>{}</code>; importing took {import_seconds:.1} s.</p>\n",
-        escape(&summary(asked)),
-        escape(
-            info["model"]["id"]
-                .as_str()
-                .or(info["model"].as_str())
-                .unwrap_or("unknown")
-        )
-    );
-    body += &all_queries(asked);
-    body += "<h2>The evidence</h2>\n<p>Above: attention, with the key patches of three scales as squares. Below, for \
-             each combination of scales: the correspondences that one homography explains.</p>\n";
+    let model = &info["model"];
+    let model = model["id"].as_str().or(model.as_str()).unwrap_or("unknown");
+    let mut figures = Vec::new();
     for one in evidence {
-        body += &figure(town, &asked[one.asked], &one.picture)?;
+        figures.push(figure(town, &asked[one.asked], &one.picture)?);
     }
+    let body = html! {
+        p.lead { (summary(asked)) }
+        p {
+            "Model " code { (model) } "; importing took " (format!("{import_seconds:.1}")) " s."
+        }
+        (all_queries(asked))
+        h2 { "The evidence" }
+        p {
+            "Above: attention, with the key patches of three scales as squares. Below, for each \
+             combination of scales: the correspondences that one homography explains."
+        }
+        @for figure in figures {
+            (figure)
+        }
+    };
     std::fs::write(path, page("PlaceFormer demo", &body))
         .with_context(|| format!("cannot write {}", path.display()))
 }
 
-fn all_queries(asked: &[Asked]) -> String {
-    let rows: Vec<Vec<String>> = asked
-        .iter()
-        .map(|one| {
-            let name =
-                |found: Option<&Found>| found.map_or("-".into(), |found| escape(&found.reference));
-            let total: f64 = one.stages.values().sum();
-            vec![
-                escape(&one.query),
-                name(one.global_best()),
-                name(one.results.first()),
-                one.best_score().to_string(),
-                one.confidence(),
-                format!("{total:.0}"),
-                one.verdict().into(),
-            ]
-        })
-        .collect();
+fn all_queries(asked: &[Asked]) -> Markup {
+    let name = |found: Option<&Found>| match found {
+        Some(found) => found.reference.clone(),
+        None => "-".into(),
+    };
+    let row = |one: &Asked| {
+        let total: f64 = one.stages.values().sum();
+        vec![
+            one.query.clone(),
+            name(one.global_best()),
+            name(one.results.first()),
+            one.best_score().to_string(),
+            one.confidence(),
+            format!("{total:.0}"),
+            one.verdict().to_owned(),
+        ]
+    };
+    let rows: Vec<Vec<String>> = asked.iter().map(row).collect();
     let headers = [
         "Query",
         "Best by global descriptor",
@@ -256,41 +262,50 @@ fn all_queries(asked: &[Asked]) -> String {
 }
 
 /// Query, best reference before and after re-ranking, and the picture of the match.
-fn figure(town: &Path, asked: &Asked, picture: &Path) -> anyhow::Result<String> {
-    let photo = |folder: &str, name: &str, caption: &str, class: &str| -> anyhow::Result<String> {
-        let uri = embed(&town.join(folder).join(name), 420)?;
-        Ok(format!(
-            "<figure class=\"{class}\"><img src=\"{uri}\" alt=\"{}\"><figcaption>{caption}</figcaption></figure>",
-            escape(name)
-        ))
-    };
-    let class = |right: bool| if right { "right" } else { "wrong" };
-    let mut html = format!(
-        "<h3>{} &mdash; {}</h3>\n<div class=\"row\">",
-        escape(&asked.query),
-        asked.verdict()
-    );
-    html += &photo("queries", &asked.query, "query", "")?;
-    if let (Some(before), Some(after)) = (asked.global_best(), asked.results.first()) {
-        html += &photo(
-            "database",
-            &before.reference,
-            "best by the global descriptor",
-            class(before.right),
-        )?;
-        html += &photo(
-            "database",
-            &after.reference,
-            "best after re-ranking",
-            class(after.right),
-        )?;
+fn figure(town: &Path, asked: &Asked, picture: &Path) -> anyhow::Result<Markup> {
+    let query = photo(&town.join("queries"), &asked.query, "query", "")?;
+    let mut references = Vec::new();
+    let captions = ["best by the global descriptor", "best after re-ranking"];
+    for (found, caption) in [asked.global_best(), asked.results.first()]
+        .into_iter()
+        .zip(captions)
+    {
+        if let Some(found) = found {
+            let class = if found.right { "right" } else { "wrong" };
+            references.push(photo(
+                &town.join("database"),
+                &found.reference,
+                caption,
+                class,
+            )?);
+        }
     }
-    html += &format!(
-        "</div>\n<img src=\"{}\" alt=\"Key patches and inlier lines of {} and its best reference\">\n",
-        embed(picture, 1400)?,
-        escape(&asked.query)
+    let alt = format!(
+        "Key patches and inlier lines of {} and its best reference",
+        asked.query
     );
-    Ok(html)
+    let uri = embed(picture, 1400)?;
+    Ok(html! {
+        h3 { (asked.query) " \u{2014} " (asked.verdict()) }
+        div.row {
+            (query)
+            @for reference in references {
+                (reference)
+            }
+        }
+        img src=(uri) alt=(alt);
+    })
+}
+
+/// A photo of the town with what it is.
+fn photo(folder: &Path, name: &str, caption: &str, class: &str) -> anyhow::Result<Markup> {
+    let uri = embed(&folder.join(name), 420)?;
+    Ok(html! {
+        figure class=(class) {
+            img src=(uri) alt=(name);
+            figcaption { (caption) }
+        }
+    })
 }
 
 fn embed(path: &Path, longest_side: u32) -> anyhow::Result<String> {

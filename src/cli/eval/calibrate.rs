@@ -1,13 +1,17 @@
 //! Fit how far best answers can be trusted.
 
-use super::{CacheArgs, DataArgs, Described, RerankArgs, write};
+use super::args::{CacheArgs, DataArgs, RerankArgs};
+use super::{describe, open_describer, write};
+use crate::cli::choice::choice;
 use crate::cli::client::{ServerArgs, ServerClient};
 use crate::cli::model_args::ModelOptions;
 use crate::cli::output::say_part;
+use crate::cli::progress::ProgressBars;
 use anyhow::{Context, ensure};
 use placeformer_core::types::{Calibration, MapName};
-use placeformer_lab::eval::calibrate::{BestAnswers, LeaveOut, OwnPlaces, Purpose, calibrate};
+use placeformer_lab::eval::calibrate::{BestAnswers, Purpose, calibrate};
 use placeformer_lab::eval::features::GlobalKind;
+use placeformer_lab::eval::own_places::{LeaveOut, OwnPlaces};
 use std::path::PathBuf;
 
 /// Arguments of this subcommand.
@@ -35,7 +39,12 @@ struct FitArgs {
     #[arg(long, default_value_t = 0.99, value_name = "SHARE", value_parser = parse_share)]
     target_precision: f64,
     /// When each query's own place is left out of the database to make it unknown.
-    #[arg(long, value_enum, default_value = "auto", value_name = "WHEN")]
+    #[arg(
+        long,
+        value_parser = choice::<LeaveOut>(),
+        default_value = "auto",
+        value_name = "WHEN"
+    )]
     leave_out: LeaveOut,
     /// Seed of the cross-validation.
     #[arg(long, default_value_t = 0)]
@@ -73,20 +82,24 @@ pub(super) fn run(args: CalibrateArgs) -> anyhow::Result<()> {
     args.rerank.check()?;
     let dataset = args.data.load()?;
     let extract = args.model.extract_config()?;
-    let described = Described::new(&extract, &args.output.cache, &dataset, GlobalKind::Head)?;
+    let describer = open_describer(&extract)?;
     let own = OwnPlaces::of(&dataset, args.fit.leave_out, args.data.radius);
-    let answered = described.answer(
-        &dataset,
-        own.as_ref(),
-        args.rerank.candidates,
-        Some(&args.rerank.config()),
-    )?;
+    if own.is_some() {
+        eprintln!("each query is also asked with its own place left out of the database");
+    }
+    let rerank = args.rerank.config();
+    let progress = ProgressBars::default();
+    let cache = &args.output.cache;
+    let described = describe(&describer, cache, &dataset, GlobalKind::Head, &progress)?;
+    let candidates = args.rerank.candidates;
+    let answered =
+        described.answer(&dataset, own.as_ref(), candidates, Some(&rerank), &progress)?;
     let answers = BestAnswers::of(&dataset, &answered.answers, &answered.left_out);
     let fitted = calibrate(
         &answers,
         Purpose {
-            model: described.extractor.model_id().clone(),
-            rerank: args.rerank.config().id(),
+            model: describer.extractor.model_id().clone(),
+            rerank: rerank.id(),
             data: args.output.data_name.unwrap_or(dataset.name),
             target_precision: args.fit.target_precision,
             seed: args.fit.seed,

@@ -1,12 +1,13 @@
 //! Training blocks of the backbone together with the head, on images.
 
-use super::head::{Source, fit};
-use super::{RunArgs, bar, facts, finish, notes, show};
+use super::head::open_cache;
+use super::{RunArgs, facts, finish, notes};
 use crate::cli::output::say;
 use crate::cli::progress::ProgressBars;
 use anyhow::ensure;
 use placeformer_lab::train::{
-    Augmentation, BackboneModel, Progress, Session, TrainError, TrainableBlocks, TripletSet,
+    Augmentation, BackboneModel, Session, SetTokens, TrainError, TrainableBlocks, TripletSet,
+    starting_head,
 };
 use placeformer_models::open_extractor;
 use placeformer_models::resolve_weights;
@@ -25,18 +26,17 @@ pub(super) fn train(
     let sides = args.data.load(args.method.seed)?;
     eprintln!("{}", sides.description);
     let extract = args.model.extract_config()?;
-    let start = starting_head(args, &extract, &sides.training)?;
+    let progress = ProgressBars::default();
+    let start = head_to_start_from(args, &extract, &sides.training, &progress)?;
     ensure!(
         *start.aggregate() == Aggregate::Mean,
         "blocks are trained under the mean of the tokens, and this head takes {}",
         start.aggregate()
     );
-    let weights = VitWeights::load(
-        &resolve_weights(&extract, &ProgressBars::default())?,
-        extract.preset,
-        extract.heads,
-    )?;
-    let (spec, images) = (extract.encoder_spec()?, ImageConfig::default());
+    let file = resolve_weights(&extract, &progress)?;
+    let weights = VitWeights::load(&file, extract.preset, extract.heads)?;
+    let spec = extract.encoder_spec()?;
+    let images = ImageConfig::default();
     let model = BackboneModel::new(weights, spec, start.weights(), blocks, images, augmentation)?;
     let identity = format!(
         "{blocks:?} {} {} {} {} {}",
@@ -46,19 +46,14 @@ pub(super) fn train(
         sides.training.fingerprint(),
         sides.validation.fingerprint()
     );
-    let bar = bar(&config)?;
-    let mut progress = |progress: Progress<'_>| show(&bar, progress);
     let session = Session {
         folder: args.out.clone(),
         identity,
-        progress: &mut progress,
+        progress: &progress,
     };
     let outcome = model.train(&sides.training, &sides.validation, &config, session)?;
-    bar.finish_and_clear();
-    let (path, head) = (
-        args.out.join("weights.safetensors"),
-        args.out.join("head.safetensors"),
-    );
+    let path = args.out.join("weights.safetensors");
+    let head = args.out.join("head.safetensors");
     let backbone = || -> Result<String, TrainError> {
         let config = ExtractConfig {
             head: HeadChoice::None,
@@ -88,19 +83,21 @@ pub(super) fn train(
     Ok(())
 }
 
-/// The head given, or a PCA of the training images. The encoder that finds it is gone before
-/// training needs the room.
-fn starting_head(
+/// The head given, or a PCA of the training images. The encoder that describes them is dropped
+/// before training needs the memory.
+fn head_to_start_from(
     args: &RunArgs,
     extract: &ExtractConfig,
     training: &TripletSet,
+    progress: &ProgressBars,
 ) -> anyhow::Result<Head> {
-    let extractor = open_extractor(extract, &ProgressBars::default())?;
+    let extractor = open_extractor(extract, progress)?;
     match extractor.head() {
         Some(head) => Ok(head.clone()),
         None => {
-            let tokens = Source::open(args, &extractor)?.tokens(training)?;
-            fit(&extractor, training, &tokens)
+            let mut cache = open_cache(args, &extractor)?;
+            let tokens = SetTokens::of(training, &extractor, &mut cache, progress)?;
+            Ok(starting_head(&extractor, training, &tokens)?)
         }
     }
 }

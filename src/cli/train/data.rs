@@ -1,11 +1,10 @@
 //! What is learnt from and what is held out, from the flags.
 
+use crate::cli::choice::choice;
 use crate::cli::data_args::ReadArgs;
-use anyhow::{Context, bail, ensure};
-use placeformer_core::folder::list_images;
-use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions, Split};
-use placeformer_lab::train::{Holdout, TripletSet};
-use std::collections::{HashMap, HashSet};
+use anyhow::{Context, ensure};
+use placeformer_lab::datasets::{DatasetKind, DatasetOptions, Split};
+use placeformer_lab::train::{Holdout, Sources, TripletRule, TripletSet, refuse_shared_images};
 use std::path::{Path, PathBuf};
 
 /// Images to learn from; several sets may be given at once.
@@ -16,7 +15,7 @@ pub(super) struct TrainData {
     /// with --root. Images of different sets are taken to show different places.
     #[arg(
         long,
-        value_enum,
+        value_parser = choice::<DatasetKind>(),
         requires = "root",
         required_unless_present = "drives"
     )]
@@ -51,7 +50,7 @@ pub(super) struct TrainData {
     validation_block: f64,
     /// A data set to validate on instead of a held-out share [split: val]; repeat with
     /// --validation-root.
-    #[arg(long, value_enum, requires = "validation_root")]
+    #[arg(long, value_parser = choice::<DatasetKind>(), requires = "validation_root")]
     validation_dataset: Vec<DatasetKind>,
     /// Where that data set lies.
     #[arg(long, value_name = "DIR", requires = "validation_dataset")]
@@ -77,13 +76,6 @@ pub(super) struct Sides {
     pub(super) description: String,
 }
 
-/// What is read before positives and negatives are told apart.
-#[derive(Default)]
-struct Sources {
-    datasets: Vec<Dataset>,
-    drives: Vec<Vec<PathBuf>>,
-}
-
 impl TrainData {
     /// Reads all sets and splits them by place.
     pub(super) fn load(&self, seed: u64) -> anyhow::Result<Sides> {
@@ -95,39 +87,21 @@ impl TrainData {
         let given = read(&self.dataset, &self.root, &options, &self.drives)?;
         let explicit = !(self.validation_dataset.is_empty() && self.validation_drives.is_empty());
         let (training, validation) = if explicit {
-            // The cities learnt from are never those judged on, so the flag for one side says
-            // nothing about the other.
-            let cities = self.validation_cities.clone();
-            let options = DatasetOptions {
-                split: Some(Split::Val),
-                cities,
-                ..self.reading.options()
-            };
-            (
-                given,
-                read(
-                    &self.validation_dataset,
-                    &self.validation_root,
-                    &options,
-                    &self.validation_drives,
-                )?,
-            )
+            (given, self.read_validation()?)
         } else {
-            self.hold_out(given, seed)?
+            given.hold_out(&self.holdout(seed))?
         };
-        let training = self.triplets(training).context("nothing to learn from")?;
-        let validation = self
-            .triplets(validation)
+        let rule = self.rule();
+        let training = training.triplets(&rule).context("nothing to learn from")?;
+        let validation = validation
+            .triplets(&rule)
             .context("nothing to validate on")?;
         refuse_shared_images(&training, &validation)?;
-        let of = |set: &TripletSet| {
-            format!(
-                "{} queries, {} database images",
-                set.queries.len(),
-                set.database.len()
-            )
-        };
-        let description = format!("training {}; validation {}", of(&training), of(&validation));
+        let description = format!(
+            "training {}; validation {}",
+            counts(&training),
+            counts(&validation)
+        );
         Ok(Sides {
             training,
             validation,
@@ -137,16 +111,12 @@ impl TrainData {
 
     /// The sets and drives as people would name them in a report.
     pub(super) fn names(&self) -> String {
-        let paths = self
-            .root
-            .iter()
-            .chain(&self.drives)
-            .chain(&self.validation_root)
-            .chain(&self.validation_drives);
-        paths
-            .map(|path| path.display().to_string())
-            .collect::<Vec<_>>()
-            .join(", ")
+        let learnt = self.root.iter().chain(&self.drives);
+        let validated = self.validation_root.iter().chain(&self.validation_drives);
+        let names = learnt
+            .chain(validated)
+            .map(|path| path.display().to_string());
+        names.collect::<Vec<String>>().join(", ")
     }
 
     /// Which images count as positives and negatives, for a report.
@@ -159,49 +129,54 @@ impl TrainData {
             ..
         } = self;
         format!(
-            "positives within {positive_m} m or {positive_frames} frames, negatives beyond {negative_m} m or \
-             {negative_frames} frames"
+            "positives within {positive_m} m or {positive_frames} frames, negatives beyond \
+             {negative_m} m or {negative_frames} frames"
         )
     }
 
-    fn hold_out(&self, given: Sources, seed: u64) -> anyhow::Result<(Sources, Sources)> {
-        let holdout = Holdout {
+    /// What is validated on where it is named. The cities learnt from are never those judged on,
+    /// so that the flag for one side says nothing about the other.
+    fn read_validation(&self) -> anyhow::Result<Sources> {
+        let options = DatasetOptions {
+            split: Some(Split::Val),
+            cities: self.validation_cities.clone(),
+            ..self.reading.options()
+        };
+        read(
+            &self.validation_dataset,
+            &self.validation_root,
+            &options,
+            &self.validation_drives,
+        )
+    }
+
+    fn holdout(&self, seed: u64) -> Holdout {
+        Holdout {
             share: self.validation_share,
             block_m: self.validation_block,
             gap_m: self.negative_m,
             gap_frames: self.negative_frames,
             seed,
-        };
-        let (mut training, mut validation) = (Sources::default(), Sources::default());
-        for dataset in &given.datasets {
-            let (learnt, kept) = holdout.by_blocks(dataset)?;
-            training.datasets.push(learnt);
-            validation.datasets.push(kept);
         }
-        (training.drives, validation.drives) = holdout.by_tails(&given.drives)?;
-        Ok((training, validation))
     }
 
-    fn triplets(&self, sources: Sources) -> anyhow::Result<TripletSet> {
-        let mut sets = Vec::new();
-        for dataset in &sources.datasets {
-            sets.push(TripletSet::by_position(
-                dataset,
-                self.positive_m,
-                self.negative_m,
-            )?);
+    fn rule(&self) -> TripletRule {
+        TripletRule {
+            positive_m: self.positive_m,
+            negative_m: self.negative_m,
+            positive_frames: self.positive_frames,
+            negative_frames: self.negative_frames,
         }
-        if !sources.drives.is_empty() {
-            sets.push(TripletSet::by_order(
-                &sources.drives,
-                self.positive_frames,
-                self.negative_frames,
-            )?);
-        }
-        Ok(TripletSet::merge(sets)?)
     }
 }
 
+fn counts(set: &TripletSet) -> String {
+    let queries = set.queries.len();
+    let database = set.database.len();
+    format!("{queries} queries, {database} database images")
+}
+
+/// Reads the sets that are named, and shows their notes.
 fn read(
     kinds: &[DatasetKind],
     roots: &[PathBuf],
@@ -214,81 +189,15 @@ fn read(
         kinds.len(),
         roots.len()
     );
-    let mut sources = Sources::default();
-    for (&kind, root) in kinds.iter().zip(roots) {
-        let dataset = datasets::load(kind, root, options)?;
-        if !dataset.database.iter().any(|item| item.position.is_some()) {
-            bail!(
-                "{}: no image has a position to tell places apart by",
-                root.display()
-            );
+    let roots = roots.iter().map(PathBuf::as_path);
+    let named: Vec<(DatasetKind, &Path)> = kinds.iter().copied().zip(roots).collect();
+    let sources = Sources::read(&named, options, drives)?;
+    for dataset in &sources.datasets {
+        for note in &dataset.notes {
+            eprintln!("{}: {note}", dataset.name);
         }
-        dataset
-            .notes
-            .iter()
-            .for_each(|note| eprintln!("{}: {note}", dataset.name));
-        sources.datasets.push(dataset);
     }
-    sources.drives = drives
-        .iter()
-        .map(|folder| frames(folder))
-        .collect::<anyhow::Result<_>>()?;
     Ok(sources)
-}
-
-/// Recall on images that were learnt from says nothing.
-fn refuse_shared_images(training: &TripletSet, validation: &TripletSet) -> anyhow::Result<()> {
-    let mut folders = HashMap::new();
-    let mut files = |set: &TripletSet| -> anyhow::Result<HashSet<PathBuf>> {
-        set.queries
-            .iter()
-            .chain(&set.database)
-            .map(|path| one_name(path, &mut folders))
-            .collect()
-    };
-    let learnt = files(training)?;
-    if let Some(shared) = files(validation)?
-        .iter()
-        .find(|path| learnt.contains(*path))
-    {
-        bail!(
-            "{} is among the images to learn from and among those to validate on",
-            shared.display()
-        );
-    }
-    Ok(())
-}
-
-/// The same path for the same file, by whatever way it was reached. Folders are looked up once:
-/// data sets hold millions of files in few of them.
-fn one_name(path: &Path, folders: &mut HashMap<PathBuf, PathBuf>) -> anyhow::Result<PathBuf> {
-    let (Some(parent), Some(name)) = (path.parent(), path.file_name()) else {
-        return Ok(path.to_owned());
-    };
-    let parent = if parent.as_os_str().is_empty() {
-        Path::new(".")
-    } else {
-        parent
-    };
-    if let Some(real) = folders.get(parent) {
-        return Ok(real.join(name));
-    }
-    let real = parent
-        .canonicalize()
-        .with_context(|| parent.display().to_string())?;
-    let file = real.join(name);
-    folders.insert(parent.to_owned(), real);
-    Ok(file)
-}
-
-fn frames(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let images = list_images(folder)?;
-    ensure!(
-        !images.is_empty(),
-        "{} holds no JPEG, PNG or WebP image",
-        folder.display()
-    );
-    Ok(images.into_iter().map(|(_, path)| path).collect())
 }
 
 #[cfg(test)]
@@ -315,11 +224,9 @@ mod tests {
             for side in ["database", "query"] {
                 let folder = root.path().join("train_val").join(city).join(side);
                 std::fs::create_dir_all(folder.join("images")).unwrap();
-                let (mut raw, mut post, mut index) = (
-                    ",key,ca,pano\n".to_owned(),
-                    ",key,easting,northing\n".to_owned(),
-                    ",key,all\n".to_owned(),
-                );
+                let mut raw = ",key,ca,pano\n".to_owned();
+                let mut post = ",key,easting,northing\n".to_owned();
+                let mut index = ",key,all\n".to_owned();
                 for place in 0..3 {
                     let key = format!("{city}-{side}-{place}");
                     std::fs::write(folder.join("images").join(format!("{key}.jpg")), b"x").unwrap();
@@ -383,7 +290,8 @@ mod tests {
     #[test]
     fn an_image_on_both_sides_is_refused_by_whatever_way_it_is_reached() {
         let root = msls();
-        let (plain, detour) = (root.path().to_owned(), root.path().join("train_val/.."));
+        let plain = root.path().to_owned();
+        let detour = root.path().join("train_val/..");
         let refused = load(&[
             "--dataset",
             "msls-val",

@@ -13,9 +13,8 @@ use crate::cli::output::say;
 use anyhow::{Context, ensure};
 use clap::Args;
 use data::TrainData;
-use indicatif::{ProgressBar, ProgressStyle};
 use placeformer_lab::train::{
-    Augmentation, Outcome, Progress, Schedule, TrainConfig, TrainableBlocks, read_log, report,
+    Augmentation, Outcome, Schedule, TrainConfig, TrainableBlocks, read_log, report,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -137,19 +136,15 @@ impl FromStr for Trainable {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let last = |text: &str| {
-            text.strip_prefix("last-")?
-                .parse()
-                .ok()
-                .filter(|&count: &usize| count > 0)
-        };
         match text {
-            "head" => Ok(Self::Head),
-            "all" => Ok(Self::Blocks(TrainableBlocks::All)),
-            _ => match last(text) {
-                Some(count) => Ok(Self::Blocks(TrainableBlocks::Last(count))),
-                None => Err("use head, last-N with N from 1, or all".into()),
-            },
+            "head" => return Ok(Self::Head),
+            "all" => return Ok(Self::Blocks(TrainableBlocks::All)),
+            _ => {}
+        }
+        let count = text.strip_prefix("last-").map(str::parse);
+        match count {
+            Some(Ok(count)) if count > 0 => Ok(Self::Blocks(TrainableBlocks::Last(count))),
+            _ => Err("use head, last-N with N from 1, or all".into()),
         }
     }
 }
@@ -160,7 +155,8 @@ pub fn run(args: TrainArgs) -> anyhow::Result<()> {
         Trainable::Head => {
             ensure!(
                 args.augmentation.is_unset(),
-                "a head is trained on cached tokens, which cannot be varied: leave the augmentation flags out"
+                "a head is trained on cached tokens, which cannot be varied: \
+                 leave the augmentation flags out"
             );
             head::train(&args.run)
         }
@@ -225,32 +221,6 @@ impl RunArgs {
     }
 }
 
-/// The bar of a run: steps, and what is known since the last cycle.
-fn bar(config: &TrainConfig) -> anyhow::Result<ProgressBar> {
-    let style =
-        ProgressStyle::with_template("training {wide_bar} {pos}/{len} steps {eta} {prefix} {msg}")?;
-    Ok(ProgressBar::new(config.schedule.total).with_style(style))
-}
-
-fn show(bar: &ProgressBar, progress: Progress<'_>) {
-    match progress {
-        Progress::Described { purpose, done, of } => {
-            bar.set_prefix(format!("{purpose} {done}/{of} images"))
-        }
-        Progress::Step { steps, loss } => {
-            bar.set_prefix(format!("loss {loss:.4}"));
-            bar.set_position(steps);
-        }
-        Progress::Cycle(record) => {
-            bar.set_position(record.step);
-            bar.set_message(format!(
-                "mean loss {:.4}, R@1 {:.1}, R@10 {:.1}",
-                record.loss, record.recall.at_1, record.recall.at_10
-            ));
-        }
-    }
-}
-
 /// What a report and a head's notes say about a run.
 fn facts(args: &RunArgs, trainable: &str, data: &str, start: &str) -> Vec<(String, String)> {
     [
@@ -296,11 +266,8 @@ fn finish(
     outcome: &Outcome,
 ) -> anyhow::Result<()> {
     let path = folder.join("report.html");
-    std::fs::write(
-        &path,
-        report::html(facts, config, &read_log(folder)?, outcome),
-    )
-    .with_context(|| format!("cannot write {}", path.display()))?;
+    let page = report::html(facts, config, &read_log(folder)?, outcome);
+    std::fs::write(&path, page).with_context(|| format!("cannot write {}", path.display()))?;
     say!("{}", report::verdict(outcome))?;
     for (name, recall) in [("before", &outcome.initial), ("kept", &outcome.best)] {
         say!(

@@ -44,37 +44,37 @@ pub fn nearest(vectors: &[f32], query: &[f32], k: usize) -> Vec<(f32, u32)> {
         }
         all
     };
-    let parts = vectors
-        .par_chunks(ROWS * GLOBAL_DIM)
-        .enumerate()
-        .map(|(number, chunk)| {
-            let distance = |row: &[f32]| {
-                let mut lanes = [0f32; 16];
-                for (row, query) in row
-                    .as_chunks::<16>()
-                    .0
-                    .iter()
-                    .zip(query.as_chunks::<16>().0)
-                {
-                    for lane in 0..16 {
-                        let difference = row[lane] - query[lane];
-                        lanes[lane] += difference * difference;
-                    }
-                }
-                lanes.iter().sum::<f32>()
-            };
-            let rows = chunk.chunks_exact(GLOBAL_DIM).enumerate();
-            select(
-                rows.map(|(row, vector)| (distance(vector), (number * ROWS + row) as u32))
-                    .collect(),
-            )
+    let scan = |(number, chunk): (usize, &[f32])| {
+        let first = number * ROWS;
+        let rows = chunk.chunks_exact(GLOBAL_DIM).enumerate();
+        let scored = rows.map(|(row, vector)| {
+            let distance = squared_distance(vector, query);
+            (distance, (first + row) as u32)
         });
-    let mut found = select(parts.reduce(Vec::new, |mut a, mut b| {
+        select(scored.collect())
+    };
+    let parts = vectors.par_chunks(ROWS * GLOBAL_DIM).enumerate().map(scan);
+    let all = parts.reduce(Vec::new, |mut a, mut b| {
         a.append(&mut b);
         select(a)
-    }));
+    });
+    let mut found = select(all);
     found.sort_by(|a, b| a.0.total_cmp(&b.0));
     found
+}
+
+/// In sixteen sums side by side, which the compiler turns into vector instructions.
+fn squared_distance(row: &[f32], query: &[f32]) -> f32 {
+    let mut lanes = [0f32; 16];
+    let row = row.as_chunks::<16>().0;
+    let query = query.as_chunks::<16>().0;
+    for (row, query) in row.iter().zip(query) {
+        for lane in 0..16 {
+            let difference = row[lane] - query[lane];
+            lanes[lane] += difference * difference;
+        }
+    }
+    lanes.iter().sum()
 }
 
 /// Re-ranking with f32 descriptors: the whole similarity matrix by candle's GEMM, its maxima, and a
@@ -99,7 +99,8 @@ type PointPair = ([f64; 2], [f64; 2]);
 
 /// Descriptors and centres of a union of scales.
 pub fn joined(patches: &KeyPatches, scales: ScaleSet) -> (Vec<f32>, Centres) {
-    let (mut descriptors, mut centres) = (Vec::new(), Vec::new());
+    let mut descriptors = Vec::new();
+    let mut centres = Vec::new();
     for scale in scales.scales() {
         let part = &patches.scales[scale - 1];
         descriptors.extend_from_slice(&part.descriptors);
@@ -112,11 +113,13 @@ pub fn joined(patches: &KeyPatches, scales: ScaleSet) -> (Vec<f32>, Centres) {
     (descriptors, centres)
 }
 
+/// Centres of mutual nearest neighbours.
 fn mutual_pairs(
     (query, query_centres): (Vec<f32>, Centres),
     (reference, reference_centres): (Vec<f32>, Centres),
 ) -> Result<Vec<PointPair>, candle_core::Error> {
-    let (n, m) = (query_centres.len(), reference_centres.len());
+    let n = query_centres.len();
+    let m = reference_centres.len();
     if n == 0 || m == 0 {
         return Ok(Vec::new());
     }
@@ -137,13 +140,16 @@ const TOLERANCE: f64 = 21.0;
 const MOST_SAMPLES: usize = 2000;
 const CONFIDENCE: f64 = 0.995;
 
+/// The most inliers of any homography that was tried.
 fn ransac(points: &[PointPair]) -> usize {
     let n = points.len();
     if n < 4 {
         return 0;
     }
     let mut rng = ChaCha8Rng::seed_from_u64(n as u64);
-    let (mut best, mut needed, mut drawn) = (0, MOST_SAMPLES, 0);
+    let mut best = 0;
+    let mut needed = MOST_SAMPLES;
+    let mut drawn = 0;
     while drawn < needed {
         drawn += 1;
         let sample = rand::seq::index::sample(&mut rng, n, 4);
@@ -155,39 +161,37 @@ fn ransac(points: &[PointPair]) -> usize {
             best = count;
             let all = (best as f64 / n as f64).powi(4);
             let enough = ((1.0 - CONFIDENCE).ln() / (1.0 - all).ln()).ceil();
-            needed = needed.min(if enough.is_finite() {
-                enough.max(0.0) as usize
-            } else {
-                MOST_SAMPLES
-            });
+            if enough.is_finite() {
+                needed = needed.min(enough.max(0.0) as usize);
+            }
         }
     }
     best
 }
 
+/// The homography through four pairs of points, its last element 1.
 fn solve(sample: impl Iterator<Item = PointPair>) -> Option<SVector<f64, 8>> {
-    let (mut a, mut b) = (SMatrix::<f64, 8, 8>::zeros(), SVector::<f64, 8>::zeros());
+    let mut a = SMatrix::<f64, 8, 8>::zeros();
+    let mut b = SVector::<f64, 8>::zeros();
     for (i, ([x, y], [u, v])) in sample.enumerate() {
         for (row, values, right) in [
             (2 * i, [x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y], u),
             (2 * i + 1, [0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y], v),
         ] {
-            values
-                .into_iter()
-                .enumerate()
-                .for_each(|(column, value)| a[(row, column)] = value);
+            for (column, value) in values.into_iter().enumerate() {
+                a[(row, column)] = value;
+            }
             b[row] = right;
         }
     }
     a.lu().solve(&b)
 }
 
+/// Whether a homography brings the first point near the second.
 fn agrees(h: &SVector<f64, 8>, ([x, y], [u, v]): &PointPair) -> bool {
     let w = h[6] * x + h[7] * y + 1.0;
-    let (dx, dy) = (
-        (h[0] * x + h[1] * y + h[2]) / w - u,
-        (h[3] * x + h[4] * y + h[5]) / w - v,
-    );
+    let dx = (h[0] * x + h[1] * y + h[2]) / w - u;
+    let dy = (h[3] * x + h[4] * y + h[5]) / w - v;
     w > 0.0 && dx * dx + dy * dy <= TOLERANCE * TOLERANCE
 }
 
@@ -216,7 +220,8 @@ mod tests {
     #[test]
     fn a_planted_homography_is_found_by_the_plain_ransac() {
         let moved = |i: usize| {
-            let (x, y) = ((i * 37 % 400) as f64, (i * 91 % 300) as f64);
+            let x = (i * 37 % 400) as f64;
+            let y = (i * 91 % 300) as f64;
             ([x, y], [1.1 * x + 12.0, 0.9 * y - 7.0])
         };
         let points: Vec<PointPair> = (0..60).map(moved).collect();

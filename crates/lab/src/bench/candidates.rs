@@ -1,9 +1,12 @@
 //! The rows of a query's candidates: loading their key patches from a store, and re-ranking them.
 
+use super::baselines;
+use super::context::{Bench, agree};
+use super::error::BenchError;
+use super::limits::Limits;
 use super::measure::paired;
+use super::row::BenchRow;
 use super::scenes::{RerankScene, unit_vector};
-use super::stages::{Bench, BenchError, agree};
-use super::{Limits, Row, baselines};
 use placeformer_core::types::{
     ContentHash, Descriptor, KeyPatches, MapName, ModelId, NewReference, PackedPatches,
     ReferenceFields, ReferenceId, SCALES, ScaleKeyPatches, ScaleSet,
@@ -116,7 +119,7 @@ impl Limits {
 
 impl Bench<'_> {
     /// Key patches from a store whose pages are in the system's cache, decoded.
-    pub(super) fn load(&self) -> Result<Row, BenchError> {
+    pub(super) fn load(&self) -> Result<BenchRow, BenchError> {
         let (store, ids) = self.store_of_streets()?;
         let files = self.new_folder("plain")?;
         let mut bytes = 0;
@@ -155,7 +158,7 @@ impl Bench<'_> {
             },
             || ids.par_iter().map(|id| plain(id).len()).sum::<usize>(),
         );
-        Row::new(
+        BenchRow::new(
             "load_100",
             "one f32 file per reference",
             times,
@@ -165,7 +168,7 @@ impl Bench<'_> {
 
     /// Candidates from a store, loaded, decoded, matched and verified; the baseline has them in
     /// memory.
-    pub(super) fn rerank(&self, name: &'static str, share: f64) -> Result<Row, BenchError> {
+    pub(super) fn rerank(&self, name: &'static str, share: f64) -> Result<BenchRow, BenchError> {
         let scene = RerankScene::new(share);
         let query = pack(&scene.query);
         let (store, ids) = store_scene(&scene, &self.new_folder(name)?)?;
@@ -177,7 +180,8 @@ impl Bench<'_> {
             }
             Reranked::DeadlinePassed => 0,
         };
-        let (our_inliers, plain_inliers): (usize, usize) = (ours(), baselines::rerank(&scene)?);
+        let our_inliers: usize = ours();
+        let plain_inliers: usize = baselines::rerank(&scene)?;
         agree(
             name,
             our_inliers as f64 >= 0.97 * plain_inliers as f64,
@@ -185,7 +189,7 @@ impl Bench<'_> {
         )?;
         let times = paired(self.rounds, ours, || baselines::rerank(&scene));
         let limit = self.limits.candidates_ms(&scene.query, &scene.candidates);
-        Row::new(name, "f32 GEMM and plain RANSAC, in memory", times, limit)
+        BenchRow::new(name, "f32 GEMM and plain RANSAC, in memory", times, limit)
     }
 }
 

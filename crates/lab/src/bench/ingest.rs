@@ -1,16 +1,17 @@
 //! The rows of taking references in: all stages of an import, and the commit alone.
 
-use super::Row;
+use super::context::Bench;
+use super::error::BenchError;
 use super::measure::in_turn;
+use super::row::BenchRow;
 use super::scenes::{RerankScene, street, unit_vector};
-use super::stages::{Bench, BenchError, REFERENCE_SIZE, street_map};
+use super::streets::{REFERENCE_SIZE, street_map};
 use bytes::Bytes;
 use placeformer_core::types::{
-    ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, NewReference, ReferenceFields,
+    ContentHash, Descriptor, KeyPatches, ModelId, NewReference, ReferenceFields,
 };
 use placeformer_store::{SqliteStore, StoreConfig, StoreError, WritePlaces};
 use placeformer_vision::extract::pack;
-use placeformer_vision::image::{ImageConfig, load_tensor};
 use std::fs::File;
 use std::io::Write;
 use std::path::Path;
@@ -28,7 +29,7 @@ impl Bench<'_> {
     /// Milliseconds a photo until it is durable and can be found, as `import` sends them; the
     /// baseline takes one after the other through the same stages. The limit is extraction alone:
     /// what overlaps it costs nothing.
-    pub(super) fn ingest(&self) -> Result<Row, BenchError> {
+    pub(super) fn ingest(&self) -> Result<BenchRow, BenchError> {
         let photos = (0..PHOTOS)
             .map(|place| street(place, 2, REFERENCE_SIZE).map(Bytes::from))
             .collect::<Result<Vec<_>, _>>()?;
@@ -57,20 +58,12 @@ impl Bench<'_> {
             ],
         )?
         .map(|ms| ms / PHOTOS as f64);
-        Row::new(
+        BenchRow::new(
             "ingest",
             "one photo after the other",
             (ours, plain),
             extraction,
         )
-    }
-
-    pub(super) fn tensor(&self, photo: &[u8]) -> Result<ImageTensor, BenchError> {
-        Ok(load_tensor(
-            photo,
-            &ImageConfig::default(),
-            self.spec.input_size,
-        )?)
     }
 
     fn one_by_one(&self, store: &SqliteStore, photos: &[Bytes]) -> Result<(), BenchError> {
@@ -85,10 +78,11 @@ impl Bench<'_> {
     /// Milliseconds a reference of writers that wait for their own commits but share syncs of the
     /// disk; the baseline commits one after the other, with a sync each. The limit is one file of
     /// the same bytes, synced once.
-    pub(super) fn commit(&self) -> Result<Row, BenchError> {
+    pub(super) fn commit(&self) -> Result<BenchRow, BenchError> {
         let folder = self.new_folder("commit")?;
         let open = |name| SqliteStore::open(&folder.join(name), &StoreConfig::default());
-        let (shared, alone) = (open("shared")?, open("alone")?);
+        let shared = open("shared")?;
+        let alone = open("alone")?;
         let scene = RerankScene::new(0.4);
         let news: Vec<NewReference> = scene
             .candidates
@@ -115,7 +109,7 @@ impl Bench<'_> {
             ],
         )?
         .map(|ms| ms / COMMITS as f64);
-        Row::new("commit", "a sync for each reference", (ours, plain), limit)
+        BenchRow::new("commit", "a sync for each reference", (ours, plain), limit)
     }
 }
 
@@ -157,7 +151,8 @@ fn reference_of((patches, number): (&KeyPatches, u64)) -> NewReference {
 
 /// A reference to be stored in [`street_map`].
 pub(super) fn new_reference(content_hash: ContentHash, descriptor: Descriptor) -> NewReference {
-    let (map, model) = (street_map(), ModelId::new("scene"));
+    let map = street_map();
+    let model = ModelId::new("scene");
     NewReference {
         map,
         fields: ReferenceFields::default(),

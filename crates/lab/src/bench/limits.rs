@@ -35,38 +35,37 @@ impl Limits {
                 .map(|sum| sum / 1e9)
         };
         let all = |work: &(dyn Fn() -> Option<f64> + Sync)| giga(rayon::broadcast(|_| work()));
+        let f32_operations = rayon::broadcast(|_| peak::f32_operations(simd, TIME));
         Self {
-            f32_gflops: rayon::broadcast(|_| peak::f32_operations(simd, TIME))
-                .into_iter()
-                .sum::<f64>()
-                / 1e9,
+            f32_gflops: f32_operations.into_iter().sum::<f64>() / 1e9,
             bf16_gflops: all(&|| peak::bf16_operations(simd, TIME)),
             int8_gops: all(&|| peak::int8_operations(simd, TIME)),
             read_gbytes: read_bandwidth() / 1e9,
         }
     }
 
-    /// What the layers and the attention of an encoder of this name and so many blocks can reach:
-    /// its name tells its precision (`fused-bf16-avx512`). Half of attention, the scores, is at
-    /// int8 unless there are matrix registers, the rest at bf16 where the CPU has it.
+    /// What the linear layers and the attention of an encoder can reach, in 10^9 operations a
+    /// second. The encoder's name tells its precision, such as `fused-bf16-avx512`. Half of
+    /// attention, the scores, is computed at int8 unless there are matrix registers; the rest at
+    /// bf16 where the CPU has it.
     pub(super) fn encoder_giga_operations(&self, encoder: &str, blocks: usize) -> (f64, f64) {
-        let (bf16, int8) = (
-            self.bf16_gflops.unwrap_or(self.f32_gflops),
-            self.int8_gops.unwrap_or(self.f32_gflops),
-        );
+        let bf16 = self.bf16_gflops.unwrap_or(self.f32_gflops);
+        let int8 = self.int8_gops.unwrap_or(self.f32_gflops);
         let attention = if encoder.contains("amx") {
             bf16
         } else {
             2.0 / (1.0 / int8 + 1.0 / bf16)
         };
-        match () {
-            () if encoder.contains("int8") => (int8, attention),
-            () if encoder.contains("mixed") => {
-                let coarse = mixed_int8_blocks(blocks).len() as f64 / blocks as f64;
-                (1.0 / (coarse / int8 + (1.0 - coarse) / bf16), attention)
-            }
-            () if encoder.contains("bf16") => (bf16, attention),
-            () => (self.f32_gflops, self.f32_gflops),
+        if encoder.contains("int8") {
+            (int8, attention)
+        } else if encoder.contains("mixed") {
+            let coarse = mixed_int8_blocks(blocks).len() as f64 / blocks as f64;
+            let layers = 1.0 / (coarse / int8 + (1.0 - coarse) / bf16);
+            (layers, attention)
+        } else if encoder.contains("bf16") {
+            (bf16, attention)
+        } else {
+            (self.f32_gflops, self.f32_gflops)
         }
     }
 

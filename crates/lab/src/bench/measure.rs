@@ -15,7 +15,8 @@ pub(super) fn paired<A, B>(
         work();
         Ok(())
     };
-    let (mut ours, mut baseline) = (|| drop(black_box(ours())), || drop(black_box(baseline())));
+    let mut ours = || drop(black_box(ours()));
+    let mut baseline = || drop(black_box(baseline()));
     let Ok([ours, baseline]) =
         in_turn(rounds, [&mut || run(&mut ours), &mut || run(&mut baseline)]);
     (ours, baseline)
@@ -33,8 +34,8 @@ pub(super) fn in_turn<const N: usize, E>(
     works.iter_mut().try_for_each(|work| work())?;
     let mut times = [const { Vec::new() }; N];
     for round in 0..rounds {
-        // Who goes first changes, so that nobody always finds the caches as the same other left
-        // them.
+        // The order changes from round to round. Otherwise each work would always run on caches
+        // that the same other work has filled.
         for place in 0..N {
             let number = (round + place) % N;
             let mut outcome = Ok(());
@@ -75,7 +76,8 @@ mod tests {
 
     #[test]
     fn both_run_as_often_as_asked() {
-        let (mut ours, mut baseline) = (0, 0);
+        let mut ours = 0;
+        let mut baseline = 0;
         let (a, b) = paired(5, || ours += 1, || baseline += 1);
         assert_eq!((ours, baseline), (6, 6));
         assert!(a >= 0.0 && b >= 0.0);

@@ -5,96 +5,40 @@
 //! |---|---|
 //! | `limits` | arithmetic and memory bandwidth that this machine reaches at most |
 //! | `measure` | ours and the baseline in turn, so that what disturbs one disturbs the other |
-//! | [`scenes`] | the inputs: a drawn photo, key patches with planted inliers, random references |
+//! | [`scenes`], `streets` | the inputs: a drawn photo, key patches with planted inliers, a map |
 //! | [`baselines`] | the plain implementations |
-//! | `stages`, `candidates`, `ingest`, `rehead` | the rows |
+//! | `context`, `rows` | what all measurements share; from a name to its measurement |
+//! | `decode`, `extract`, `search`, `query`, `candidates`, `ingest`, `rehead` | the measurements |
 //! | [`filled`] | a store that shows more references than it holds |
+//! | `service` | the whole service, which the caller passes in |
 //!
 //! The Criterion benchmarks use the same inputs and baselines.
 
 pub mod baselines;
 mod candidates;
+mod context;
+mod decode;
+mod error;
+mod extract;
 pub mod filled;
 mod ingest;
 mod limits;
 mod measure;
+mod names;
+mod query;
 mod rehead;
+mod row;
+mod rows;
 pub mod scenes;
+mod search;
 mod service;
-mod stages;
+mod streets;
 
 pub use candidates::store_scene;
+pub use context::Bench;
+pub use error::BenchError;
 pub use limits::Limits;
+pub use names::NAMES;
+pub use row::BenchRow;
 pub use service::{MeasuredService, ServiceError, StartService};
-pub use stages::{Bench, BenchError, NAMES, REFERENCE_SIZE, fill_with_streets, street_map};
-
-use serde::Serialize;
-
-/// One comparison. Times are medians in milliseconds.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Row {
-    /// What was measured.
-    pub name: String,
-    /// Ours.
-    pub ours_ms: f64,
-    /// What it is compared with.
-    pub baseline: String,
-    /// The baseline.
-    pub baseline_ms: f64,
-    /// How many times faster ours is.
-    pub ratio: f64,
-    /// The time that the machine's limit allows at best, divided by ours. Above 1 where memory is
-    /// the limit and the data fit a cache.
-    pub limit_share: f64,
-}
-
-impl Row {
-    /// # Errors
-    /// A figure is not a finite number, which a report could not hold.
-    fn new(
-        name: &str,
-        baseline: &str,
-        (ours_ms, baseline_ms): (f64, f64),
-        limit_ms: f64,
-    ) -> Result<Self, BenchError> {
-        let (ratio, limit_share) = (baseline_ms / ours_ms, limit_ms / ours_ms);
-        if !(ratio.is_finite() && limit_share.is_finite()) {
-            return Err(BenchError::NotComparable {
-                row: name.to_owned(),
-                ours_ms,
-                baseline_ms,
-                limit_ms,
-            });
-        }
-        Ok(Self {
-            name: name.to_owned(),
-            ours_ms,
-            baseline: baseline.to_owned(),
-            baseline_ms,
-            ratio,
-            limit_share,
-        })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_figure_of_a_row_is_a_number() {
-        let row = Row::new("a", "b", (2.0, 6.0), 1.0).unwrap();
-        assert_eq!((row.ratio, row.limit_share), (3.0, 0.5));
-        for (times, limit) in [
-            ((0.0, 1.0), 1.0),
-            ((f64::NAN, 1.0), 1.0),
-            ((1.0, f64::NAN), 1.0),
-            ((1.0, 1.0), f64::NAN),
-        ] {
-            assert!(matches!(
-                Row::new("a", "b", times, limit),
-                Err(BenchError::NotComparable { .. })
-            ));
-        }
-    }
-}
+pub use streets::{REFERENCE_SIZE, fill_with_streets, street_map};

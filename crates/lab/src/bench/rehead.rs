@@ -1,10 +1,12 @@
 //! The row of giving a map another head.
 
-use super::Row;
+use super::context::Bench;
+use super::error::BenchError;
 use super::ingest::{new_reference, write_and_sync};
 use super::measure::in_turn;
+use super::row::BenchRow;
 use super::scenes::{street, unit_vector};
-use super::stages::{Bench, BenchError, REFERENCE_SIZE, street_map};
+use super::streets::{REFERENCE_SIZE, street_map};
 use placeformer_core::types::{
     ContentHash, Descriptor, GLOBAL_DIM, KeyPatches, ModelId, PatchGrid, PoolingStride,
     ScaleKeyPatches,
@@ -25,7 +27,7 @@ impl Bench<'_> {
     /// Milliseconds until all vectors of a map come from another head, as `map rehead` does it; the
     /// baseline describes the map's images again, of which one is measured. The limit is one file
     /// of the same vectors, synced once.
-    pub(super) fn rehead(&self) -> Result<Row, BenchError> {
+    pub(super) fn rehead(&self) -> Result<BenchRow, BenchError> {
         let head = self
             .extractor
             .head()
@@ -56,7 +58,7 @@ impl Bench<'_> {
                 &mut || write_and_sync(&folder.join("plain"), bytes),
             ],
         )?;
-        Row::new(
+        BenchRow::new(
             "rehead_100k",
             "extraction, times 100 000",
             (ours, one * REFERENCES as f64),

@@ -1,7 +1,7 @@
 //! The whole service, as far as the rows that measure it need it.
 //!
-//! The service is built upon this crate's neighbours and not below it, so that this crate cannot
-//! name it. Whoever can, the command line, passes it in.
+//! The service is a package above this crate, which therefore cannot name it. The command line,
+//! which knows both, passes it in.
 
 use bytes::Bytes;
 use placeformer_core::types::MapName;

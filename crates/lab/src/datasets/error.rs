@@ -35,7 +35,11 @@ pub enum DatasetError {
         reason: String,
     },
     /// The ground truth speaks of images that are not in the folders.
-    #[error("{}: {count} image names are not in {}, among them {example:?}", path.display(), folder.display())]
+    #[error(
+        "{}: {count} image names are not in {}, among them {example:?}",
+        path.display(),
+        folder.display()
+    )]
     UnknownImages {
         /// The ground-truth file.
         path: PathBuf,

@@ -1,6 +1,6 @@
 //! Checks that a data set lies on disk as its reader expects.
 
-use super::DatasetError;
+use super::error::DatasetError;
 use std::path::PathBuf;
 
 /// The folder, or an error that says what the layout should be.

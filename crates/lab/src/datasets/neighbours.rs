@@ -3,7 +3,7 @@
 //! Points are hashed into square cells as wide as the radius, so that all neighbours of a point lie
 //! in the 3x3 cells around it: a million images join in seconds.
 
-use super::{Item, Truth};
+use super::dataset::{Item, Truth};
 use placeformer_core::geography::MetricPoint;
 use std::collections::HashMap;
 
@@ -34,7 +34,8 @@ impl NeighbourGrid {
             .filter_map(|key| self.cells.get(&key))
             .flatten()
             .filter(move |(_, point)| {
-                let (east, north) = (point.east - centre.east, point.north - centre.north);
+                let east = point.east - centre.east;
+                let north = point.north - centre.north;
                 // Compared as squares, inclusive: an image exactly at the radius is a positive.
                 east * east + north * north <= self.radius_m * self.radius_m
             })
@@ -141,7 +142,8 @@ mod tests {
             found.sort_unstable();
             let expected: Vec<usize> = (0..points.len())
                 .filter(|&i| {
-                    let (e, n) = (points[i].0 - centre.0, points[i].1 - centre.1);
+                    let e = points[i].0 - centre.0;
+                    let n = points[i].1 - centre.1;
                     e * e + n * n <= radius * radius
                 })
                 .collect();

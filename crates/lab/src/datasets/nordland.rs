@@ -7,10 +7,13 @@
 //! beside them, only the frames it lists take part: the usual evaluation leaves tunnels and
 //! stations out.
 
-use super::DatasetError;
+use super::dataset::{Dataset, Item, Skipped, Truth};
+use super::error::DatasetError;
+use super::kind::Split;
 use super::layout::require;
+use super::options::DatasetOptions;
 use super::utm::find_split;
-use super::{Dataset, DatasetOptions, Item, Skipped, Split, Truth};
+use crate::choice::Choice;
 use placeformer_core::folder::list_images;
 use placeformer_core::geography::UtmName;
 use std::collections::BTreeSet;
@@ -30,61 +33,77 @@ pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, Dat
     }
     let clean = clean_frames(root)?;
     let mut skipped = Vec::new();
-    let mut read = |folder: &Path| -> Result<(Vec<Item>, Vec<u64>), DatasetError> {
-        let (mut items, mut frames) = (Vec::new(), Vec::new());
-        for (name, path) in list_images(folder)? {
-            match frame_of(&name) {
-                Some(frame) if clean.as_ref().is_some_and(|clean| !clean.contains(&frame)) => {
-                    skipped.push(Skipped {
-                        name,
-                        reason: format!("not in {CLEAN}"),
-                    });
-                }
-                Some(frame) => {
-                    items.push(Item::new(name, path));
-                    frames.push(frame);
-                }
-                None => skipped.push(Skipped {
-                    name,
-                    reason: "the name has no frame number".into(),
-                }),
-            }
-        }
-        Ok((items, frames))
-    };
-    let (database, database_frames) = read(&database_dir)?;
-    let (queries, query_frames) = read(&queries_dir)?;
-    let mut by_frame: Vec<(u64, usize)> = database_frames
-        .iter()
-        .enumerate()
-        .map(|(i, &frame)| (frame, i))
-        .collect();
+    let database = read_side(&database_dir, clean.as_ref(), &mut skipped)?;
+    let queries = read_side(&queries_dir, clean.as_ref(), &mut skipped)?;
+    let frames = database.frames.iter().enumerate();
+    let mut by_frame: Vec<(u64, usize)> = frames.map(|(i, &frame)| (frame, i)).collect();
     by_frame.sort_unstable();
-    let truth = query_frames
+    let tolerance = options.frame_tolerance;
+    let truth = queries
+        .frames
         .iter()
-        .map(|&frame| truth_of(frame, options.frame_tolerance, &by_frame))
+        .map(|&frame| truth_of(frame, tolerance, &by_frame))
         .collect();
+    Ok(Dataset {
+        name: NAME.into(),
+        database: database.items,
+        queries: queries.items,
+        truth,
+        skipped,
+        notes: notes(options, clean.as_ref()),
+    })
+}
+
+/// The images of one side with their frame numbers.
+#[derive(Default)]
+struct FilmSide {
+    items: Vec<Item>,
+    frames: Vec<u64>,
+}
+
+/// Reads the images of a folder that have a frame number and, where `clean` lists frames, are
+/// among these.
+fn read_side(
+    folder: &Path,
+    clean: Option<&BTreeSet<u64>>,
+    skipped: &mut Vec<Skipped>,
+) -> Result<FilmSide, DatasetError> {
+    let mut side = FilmSide::default();
+    for (name, path) in list_images(folder)? {
+        let Some(frame) = frame_of(&name) else {
+            skipped.push(Skipped {
+                name,
+                reason: "the name has no frame number".into(),
+            });
+            continue;
+        };
+        if clean.is_some_and(|clean| !clean.contains(&frame)) {
+            skipped.push(Skipped {
+                name,
+                reason: format!("not in {CLEAN}"),
+            });
+            continue;
+        }
+        side.items.push(Item::new(name, path));
+        side.frames.push(frame);
+    }
+    Ok(side)
+}
+
+/// What a reader of the results should know.
+fn notes(options: &DatasetOptions, clean: Option<&BTreeSet<u64>>) -> Vec<String> {
     let mut notes = vec![format!(
         "positives lie within {} frames",
         options.frame_tolerance
     )];
     if let Some(clean) = clean {
-        notes.push(format!(
-            "only the {} frames of {CLEAN} take part",
-            clean.len()
-        ));
+        let count = clean.len();
+        notes.push(format!("only the {count} frames of {CLEAN} take part"));
     }
     if options.swap {
         notes.push("the seasons are exchanged: what is usually asked is searched".into());
     }
-    Ok(Dataset {
-        name: NAME.into(),
-        database,
-        queries,
-        truth,
-        skipped,
-        notes,
-    })
+    notes
 }
 
 /// The frames that take part, if the data set says so.
@@ -96,48 +115,47 @@ fn clean_frames(root: &Path) -> Result<Option<BTreeSet<u64>>, DatasetError> {
         Err(error) => return Err(DatasetError::io(&path)(error)),
     };
     let mut frames = BTreeSet::new();
-    for (line, name) in (1..)
-        .zip(text.lines().map(str::trim))
-        .filter(|(_, name)| !name.is_empty())
-    {
-        let reason = || format!("{name:?} has no frame number");
+    for (line, name) in (1..).zip(text.lines().map(str::trim)) {
+        if name.is_empty() {
+            continue;
+        }
         let frame = frame_of(name).ok_or_else(|| DatasetError::Record {
             path: path.clone(),
             line,
-            reason: reason(),
+            reason: format!("{name:?} has no frame number"),
         })?;
         frames.insert(frame);
     }
     Ok(Some(frames))
 }
 
+/// The folders of the database and of the queries.
 fn folders(root: &Path, split: Split) -> Result<(PathBuf, PathBuf), DatasetError> {
-    let films = (root.join("summer"), root.join("winter"));
-    if films.0.exists() && films.1.exists() {
-        return Ok(films);
+    let summer = root.join("summer");
+    let winter = root.join("winter");
+    if summer.exists() && winter.exists() {
+        return Ok((summer, winter));
     }
     let nested = || root.join("images").join(split.as_str());
-    let folder = require(
-        NAME,
-        find_split(root, split).unwrap_or_else(nested),
-        EXPECTED,
-    )?;
-    Ok((
-        require(NAME, folder.join("database"), EXPECTED)?,
-        require(NAME, folder.join("queries"), EXPECTED)?,
-    ))
+    let folder = find_split(root, split).unwrap_or_else(nested);
+    let folder = require(NAME, folder, EXPECTED)?;
+    let database = require(NAME, folder.join("database"), EXPECTED)?;
+    let queries = require(NAME, folder.join("queries"), EXPECTED)?;
+    Ok((database, queries))
 }
 
+/// The frame number in the name of an image.
 fn frame_of(name: &str) -> Option<u64> {
     if let Ok(parsed) = UtmName::parse(name) {
         return parsed.pano_id.parse().ok();
     }
     let file = name.rsplit('/').next()?;
     let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);
-    let digits = stem.len() - stem.bytes().rev().take_while(u8::is_ascii_digit).count();
-    stem[digits..].parse().ok()
+    let digits = stem.bytes().rev().take_while(u8::is_ascii_digit).count();
+    stem[stem.len() - digits..].parse().ok()
 }
 
+/// The images at most `tolerance` frames away; `by_frame` is sorted.
 fn truth_of(frame: u64, tolerance: u64, by_frame: &[(u64, usize)]) -> Truth {
     let start = by_frame.partition_point(|&(other, _)| other < frame.saturating_sub(tolerance));
     let within = by_frame[start..]

@@ -4,15 +4,20 @@
 //! below the two folders. A query the file does not mention stays [`Truth::Unknown`]: it is
 //! searched but not counted.
 
-use super::DatasetError;
+use super::dataset::{Dataset, Item, Truth};
+use super::error::DatasetError;
+use super::positions;
 use super::table::Table;
-use super::{Dataset, Item, Truth, positions};
 use placeformer_core::folder::list_images;
 use std::collections::HashMap;
 use std::path::Path;
 
 /// Reads the images of both folders, the pairs between them, and positions from a `positions.csv`
-/// beside the pairs.
+/// in the folder of the pairs.
+///
+/// # Errors
+/// A folder or file cannot be read, the pairs contradict each other or name images that are not
+/// there, or one side has no image.
 pub fn load_pairs(
     database_dir: &Path,
     queries_dir: &Path,
@@ -25,7 +30,8 @@ pub fn load_pairs(
     }
     let mut labels = Labels::new(database_dir, queries_dir, &database, &queries, ground_truth);
     let table = Table::read(ground_truth)?;
-    let (query_column, reference_column) = (table.column("query")?, table.column("reference")?);
+    let query_column = table.column("query")?;
+    let reference_column = table.column("reference")?;
     for row in table.rows() {
         labels
             .add(row.text(query_column), row.text(reference_column))
@@ -54,7 +60,7 @@ fn items(folder: &Path) -> Result<Vec<Item>, DatasetError> {
         .collect())
 }
 
-/// Collects the rows of a ground truth, and the names in it that nobody has.
+/// Collects the rows of a ground truth, and the names in it that no image has.
 struct Labels<'a> {
     folders: [&'a Path; 2],
     ground_truth: &'a Path,
@@ -89,6 +95,7 @@ impl<'a> Labels<'a> {
         }
     }
 
+    /// Takes one row; the error says how it contradicts an earlier one.
     fn add(&mut self, query: &str, reference: &str) -> Result<(), String> {
         let Some(&index) = self.queries.get(query) else {
             self.unknown[0].push(query.to_owned());
@@ -118,17 +125,16 @@ impl<'a> Labels<'a> {
         Ok(())
     }
 
+    /// The truth of every query, and notes about it.
     fn finish(self) -> Result<(Vec<Truth>, Vec<String>), DatasetError> {
         for (mut names, folder) in self.unknown.into_iter().zip(self.folders) {
             names.sort_unstable();
             names.dedup();
             if let Some(example) = names.first().cloned() {
-                let (path, folder, count) =
-                    (self.ground_truth.to_owned(), folder.to_owned(), names.len());
                 return Err(DatasetError::UnknownImages {
-                    path,
-                    folder,
-                    count,
+                    path: self.ground_truth.to_owned(),
+                    folder: folder.to_owned(),
+                    count: names.len(),
                     example,
                 });
             }
@@ -143,16 +149,13 @@ impl<'a> Labels<'a> {
             .iter()
             .filter(|entry| **entry == Truth::Unknown)
             .count();
-        let note =
-            format!("{unlabelled} queries are not in the ground truth: searched, but not counted");
-        Ok((
-            truth,
-            if unlabelled > 0 {
-                vec![note]
-            } else {
-                Vec::new()
-            },
-        ))
+        let mut notes = Vec::new();
+        if unlabelled > 0 {
+            notes.push(format!(
+                "{unlabelled} queries are not in the ground truth: searched, but not counted"
+            ));
+        }
+        Ok((truth, notes))
     }
 }
 

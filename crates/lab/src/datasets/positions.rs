@@ -5,8 +5,8 @@
 //! data set find their rows in one table. Positions become metres in the plane of their UTM zones;
 //! regions far apart become groups, see `zones`.
 
-use super::DatasetError;
-use super::Item;
+use super::dataset::Item;
+use super::error::DatasetError;
 use super::table::{Column, Row, Table};
 use super::zones::Zones;
 use placeformer_core::folder::relative_name;
@@ -27,7 +27,8 @@ pub(super) fn locate(folder: &Path, sides: [&mut [Item]; 2]) -> Result<(), Datas
     else {
         return Ok(());
     };
-    let (file, heading) = (table.column("file")?, table.optional_column("heading"));
+    let file = table.column("file")?;
+    let heading = table.optional_column("heading");
     let mut rows = HashMap::new();
     for row in table.rows() {
         let beyond =
@@ -69,10 +70,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("positions.csv"), csv).unwrap();
         let item = |name: &str| Item::new(name, folder.path().join(name));
-        let (mut database, mut queries) = (
-            vec![item("database/a.jpg"), item("database/b.jpg")],
-            vec![item("queries/a.jpg")],
-        );
+        let mut database = vec![item("database/a.jpg"), item("database/b.jpg")];
+        let mut queries = vec![item("queries/a.jpg")];
         locate(folder.path(), [&mut database, &mut queries])?;
         Ok([database, queries])
     }
@@ -81,7 +80,8 @@ mod tests {
     fn both_sides_find_their_rows_in_metres() {
         let csv = "file,lat,lon,heading\ndatabase\\a.jpg,51.5,7.4,90\nqueries/a.jpg,51.5001,7.4,\ndatabase/b.jpg,,,10\n";
         let [database, queries] = located(csv).unwrap();
-        let (a, q) = (database[0].position.unwrap(), queries[0].position.unwrap());
+        let a = database[0].position.unwrap();
+        let q = queries[0].position.unwrap();
         assert!(
             (q.north - a.north - 11.12).abs() < 0.1 && (q.east - a.east).abs() < 0.5,
             "{a:?} {q:?}"
@@ -102,7 +102,8 @@ mod tests {
         let csv = "file,lat,lon\ndatabase/a.jpg,37.77,-122.42\ndatabase/b.jpg,55.67,12.57\nqueries/a.jpg,55.67018,12.57\n";
         let [database, queries] = located(csv).unwrap();
         assert!(database[1].group == queries[0].group && database[0].group != queries[0].group);
-        let (b, q) = (database[1].position.unwrap(), queries[0].position.unwrap());
+        let b = database[1].position.unwrap();
+        let q = queries[0].position.unwrap();
         assert!(
             ((b.east - q.east).hypot(b.north - q.north) - 20.0).abs() < 0.2,
             "{b:?} {q:?}"

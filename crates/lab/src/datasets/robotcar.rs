@@ -5,10 +5,13 @@
 //! names query images with a 4x4 camera-to-world matrix each; `robotcar_v2_test.txt` names those
 //! whose poses are withheld. Metadata say `.png` where the images are `.jpg`.
 
-use super::DatasetError;
+use super::dataset::{Dataset, Item, Truth};
+use super::error::DatasetError;
+use super::kind::Split;
 use super::layout::require;
 use super::neighbours::NeighbourGrid;
-use super::{Dataset, DatasetOptions, Item, Split, Truth};
+use super::options::DatasetOptions;
+use super::pose::Pose;
 use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
 use placeformer_core::geography::MetricPoint;
 use std::collections::BTreeSet;
@@ -17,30 +20,6 @@ use std::path::Path;
 const NAME: &str = "robotcar-seasons-v2";
 const EXPECTED: &str =
     "images/<condition>/<camera>, 3D-models/all-merged/all.nvm and robotcar_v2_{train,test}.txt";
-
-/// Where a camera stood and how it was turned.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Pose {
-    /// Rotation from world to camera.
-    pub rotation: UnitQuaternion<f64>,
-    /// Centre of the camera in world coordinates, metres.
-    pub centre: Vector3<f64>,
-}
-
-impl Pose {
-    /// Distance of the centres in metres and angle between the orientations in degrees.
-    pub fn error(&self, other: &Self) -> (f64, f64) {
-        (
-            (self.centre - other.centre).norm(),
-            self.rotation.angle_to(&other.rotation).to_degrees(),
-        )
-    }
-
-    /// Translation of the world-to-camera transform, as the benchmark wants it.
-    pub fn translation(&self) -> Vector3<f64> {
-        -(self.rotation * self.centre)
-    }
-}
 
 /// Reads the references seen by the queries' cameras, and the queries of one split.
 pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, DatasetError> {
@@ -55,17 +34,15 @@ pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, Dat
             &images,
         )?,
     };
-    let cameras: BTreeSet<&str> = queries
-        .iter()
-        .filter_map(|query| camera_of(&query.name))
-        .collect();
+    let cameras = queries.iter().filter_map(|query| camera_of(&query.name));
+    let cameras: BTreeSet<String> = cameras.map(str::to_owned).collect();
     let nvm = require(NAME, root.join("3D-models/all-merged/all.nvm"), EXPECTED)?;
     let all = read_nvm(&nvm, &images)?;
     let of_all = all.len();
     let seen = |item: &Item| camera_of(&item.name).is_some_and(|camera| cameras.contains(camera));
     let database: Vec<Item> = all.into_iter().filter(seen).collect();
     let truth = truth_by_pose(&database, &queries, options.radius_m);
-    let cameras: Vec<&str> = cameras.into_iter().collect();
+    let cameras: Vec<String> = cameras.into_iter().collect();
     let notes = vec![format!(
         "{} of {of_all} references are of the queries' cameras ({})",
         database.len(),
@@ -74,17 +51,20 @@ pub(super) fn load(root: &Path, options: &DatasetOptions) -> Result<Dataset, Dat
     Ok(Dataset {
         name: NAME.into(),
         database,
-        queries: queries.clone(),
+        queries,
         truth,
         skipped: Vec::new(),
         notes,
     })
 }
 
+/// The camera of an image: the last folder of its name.
 fn camera_of(name: &str) -> Option<&str> {
     name.split('/').nth_back(1)
 }
 
+/// Positives by the distance of camera centres in three dimensions; the grid finds those near in
+/// the plane first.
 fn truth_by_pose(database: &[Item], queries: &[Item], radius_m: f64) -> Vec<Truth> {
     let flat = |pose: &Pose| MetricPoint {
         east: pose.centre.x,
@@ -137,6 +117,7 @@ fn read_text(path: &Path) -> Result<String, DatasetError> {
     std::fs::read_to_string(path).map_err(DatasetError::io(path))
 }
 
+/// An error that names a line of a file.
 fn wrong(path: &Path, line: u64, reason: impl Into<String>) -> DatasetError {
     DatasetError::Record {
         path: path.to_owned(),
@@ -145,6 +126,7 @@ fn wrong(path: &Path, line: u64, reason: impl Into<String>) -> DatasetError {
     }
 }
 
+/// All `fields` as finite numbers.
 fn numbers<'a>(
     path: &Path,
     line: u64,
@@ -157,6 +139,7 @@ fn numbers<'a>(
     fields.map(parse).collect()
 }
 
+/// Names of images, one a line.
 fn read_list(path: &Path, images: &Path) -> Result<Vec<Item>, DatasetError> {
     let text = read_text(path)?;
     Ok(lines(&text)
@@ -194,14 +177,11 @@ fn read_posed(path: &Path, images: &Path) -> Result<Vec<Item>, DatasetError> {
         let to_world =
             UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
         let centre = Vector3::new(matrix[3], matrix[7], matrix[11]);
-        items.push(item(
-            images,
-            name,
-            Some(Pose {
-                rotation: to_world.inverse(),
-                centre,
-            }),
-        ));
+        let pose = Pose {
+            rotation: to_world.inverse(),
+            centre,
+        };
+        items.push(item(images, name, Some(pose)));
     }
     Ok(items)
 }
@@ -234,14 +214,8 @@ fn read_nvm(path: &Path, images: &Path) -> Result<Vec<Item>, DatasetError> {
         };
         let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-9)
             .ok_or_else(|| wrong(path, line, "the quaternion is zero"))?;
-        items.push(item(
-            images,
-            name,
-            Some(Pose {
-                rotation,
-                centre: Vector3::new(cx, cy, cz),
-            }),
-        ));
+        let centre = Vector3::new(cx, cy, cz);
+        items.push(item(images, name, Some(Pose { rotation, centre })));
     }
     if items.len() == count {
         Ok(items)

@@ -1,7 +1,7 @@
 //! CSV files of the data sets: columns by name, errors by line, Windows line ends and byte-order
 //! marks tolerated.
 
-use super::DatasetError;
+use super::error::DatasetError;
 use std::path::{Path, PathBuf};
 
 /// A whole CSV file with a header.

@@ -5,11 +5,14 @@
 //! Zones that touch are projected into one; zones that do not (MSLS has San Francisco and
 //! Copenhagen) are kept apart as groups, see `zones`.
 
-use super::DatasetError;
+use super::dataset::{Dataset, Item, Skipped};
+use super::error::DatasetError;
+use super::kind::Split;
 use super::layout::require;
 use super::neighbours::truth_by_distance;
+use super::options::DatasetOptions;
 use super::zones::Zones;
-use super::{Dataset, DatasetOptions, Item, Skipped, Split};
+use crate::choice::Choice;
 use placeformer_core::folder::list_images;
 use placeformer_core::geography::MetricPoint;
 use placeformer_core::geography::{UtmName, UtmZone};
@@ -18,7 +21,7 @@ use std::path::{Path, PathBuf};
 const EXPECTED: &str =
     "images/{train,val,test}/{database,queries} with @utm_east@utm_north@...@.jpg names";
 
-/// The group of images whose zone nobody knows, beside images of several regions.
+/// The group of images that name no zone, where other images are of several regions.
 const NO_ZONE: &str = "zone unknown";
 
 /// Reads one split; positives by radius, and by view angle where the options ask for it and the
@@ -29,33 +32,26 @@ pub(super) fn load(
     options: &DatasetOptions,
 ) -> Result<Dataset, DatasetError> {
     let split = options.split.unwrap_or(Split::Test);
-    let wanted = || root.join("images").join(split.as_str());
     let folder = find_split(root, split).ok_or_else(|| DatasetError::Layout {
         dataset: name,
-        path: wanted(),
+        path: root.join("images").join(split.as_str()),
         expected: EXPECTED,
     })?;
+    let database_dir = require(name, folder.join("database"), EXPECTED)?;
+    let queries_dir = require(name, folder.join("queries"), EXPECTED)?;
     let mut skipped = Vec::new();
-    let mut database = read(
-        &require(name, folder.join("database"), EXPECTED)?,
-        &mut skipped,
-    )?;
-    let mut queries = read(
-        &require(name, folder.join("queries"), EXPECTED)?,
-        &mut skipped,
-    )?;
+    let mut database = read(&database_dir, &mut skipped)?;
+    let mut queries = read(&queries_dir, &mut skipped)?;
     let mut notes = project([&mut database, &mut queries]);
-    let (database, queries) = (items(database), items(queries));
+    let database = items(database);
+    let queries = items(queries);
     if let Some(angle) = options.max_angle_deg {
         notes.push(format!(
             "positives lie within {} m and {angle} degrees of view angle",
             options.radius_m
         ));
-        let without = database
-            .iter()
-            .chain(&queries)
-            .filter(|item| item.heading.is_none())
-            .count();
+        let all = database.iter().chain(&queries);
+        let without = all.filter(|item| item.heading.is_none()).count();
         if without > 0 {
             notes.push(format!(
                 "{without} images have no view angle; for them only the distance counts"
@@ -89,13 +85,13 @@ pub(super) fn find_split(root: &Path, split: Split) -> Option<PathBuf> {
 }
 
 /// An image and the grid its coordinates refer to.
-struct Placed {
+struct GridImage {
     item: Item,
     point: MetricPoint,
     zone: Option<UtmZone>,
 }
 
-fn read(folder: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<Placed>, DatasetError> {
+fn read(folder: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<GridImage>, DatasetError> {
     let mut images = Vec::new();
     for (name, path) in list_images(folder)? {
         match UtmName::parse(&name) {
@@ -106,7 +102,7 @@ fn read(folder: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<Placed>, Datase
                     heading,
                     ..Item::new(name, path)
                 };
-                images.push(Placed {
+                images.push(GridImage {
                     item,
                     point: parsed.point,
                     zone: parsed.zone,
@@ -123,24 +119,21 @@ fn read(folder: &Path, skipped: &mut Vec<Skipped>) -> Result<Vec<Placed>, Datase
 
 /// Brings all positions into the plane of their cluster of zones, and tells clusters apart by the
 /// items' group.
-fn project(mut sides: [&mut Vec<Placed>; 2]) -> Vec<String> {
-    let zones = Zones::of(
-        sides
-            .iter()
-            .flat_map(|side| side.iter().filter_map(|placed| placed.zone)),
-    );
-    let (mut without_zone, mut off_the_grid) = (0, 0);
-    for placed in sides.iter_mut().flat_map(|side| side.iter_mut()) {
-        match placed.zone {
+fn project(mut sides: [&mut Vec<GridImage>; 2]) -> Vec<String> {
+    let images = sides.iter().flat_map(|side| side.iter());
+    let zones = Zones::of(images.filter_map(|image| image.zone));
+    let mut without_zone = 0;
+    let mut off_the_grid = 0;
+    for image in sides.iter_mut().flat_map(|side| side.iter_mut()) {
+        match image.zone {
             Some(zone) => {
-                placed.item.position = zones.project(zone, placed.point);
-                placed.item.group = zones.group(zone);
-                off_the_grid += usize::from(placed.item.position.is_none());
+                image.item.position = zones.project(zone, image.point);
+                image.item.group = zones.group(zone);
+                off_the_grid += usize::from(image.item.position.is_none());
             }
-            // Where there is but one plane, a name that leaves the zone out is taken to mean that
-            // one.
+            // Where there is only one plane, a name that leaves the zone out is taken to mean it.
             None if zones.are_apart() => {
-                placed.item.group = Some(NO_ZONE.to_owned());
+                image.item.group = Some(NO_ZONE.to_owned());
                 without_zone += 1;
             }
             None => {}
@@ -160,256 +153,9 @@ fn project(mut sides: [&mut Vec<Placed>; 2]) -> Vec<String> {
     notes
 }
 
-fn items(side: Vec<Placed>) -> Vec<Item> {
-    side.into_iter().map(|placed| placed.item).collect()
+fn items(side: Vec<GridImage>) -> Vec<Item> {
+    side.into_iter().map(|image| image.item).collect()
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::{DatasetKind, Truth, load as load_dataset};
-    use super::*;
-
-    fn write(root: &Path, names: &[&str]) {
-        for name in names {
-            let path = root.join(name);
-            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-            std::fs::write(path, b"x").unwrap();
-        }
-    }
-
-    #[test]
-    fn radius_unreadable_names_and_same_names_in_two_folders() {
-        let root = tempfile::tempdir().unwrap();
-        write(
-            root.path(),
-            &[
-                "images/test/database/2013/@0500000.00@4000000.00@17@T@@@p@00@@@@@@@.jpg",
-                "images/test/database/2014/@0500000.00@4000000.00@17@T@@@p@00@@@@@@@.jpg",
-                "images/test/database/@0500030.00@4000000.00@17@T@@@q@00@@@@@@@.jpg",
-                "images/test/database/cover.jpg",
-                "images/test/queries/@0500010.00@4000000.00@17@T@@@a@@@@@@@@.jpg",
-                "images/test/queries/@0501000.00@4000000.00@17@T@@@b@@@@@@@@.jpg",
-            ],
-        );
-        let dataset = load_dataset(
-            DatasetKind::Pitts30k,
-            root.path(),
-            &DatasetOptions::default(),
-        )
-        .unwrap();
-        assert_eq!((dataset.database.len(), dataset.queries.len()), (3, 2));
-        assert_eq!(
-            dataset.truth,
-            [Truth::Positives(vec![0, 1, 2]), Truth::NoMatch]
-        );
-        assert_eq!(dataset.skipped.len(), 1);
-        assert!(dataset.notes.is_empty());
-    }
-
-    #[test]
-    fn images_on_both_sides_of_a_zone_border_are_neighbours() {
-        let root = tempfile::tempdir().unwrap();
-        // 6 degrees east is the border of zones 31 and 32; the points lie 7 m apart across it.
-        let name = |zone: UtmZone, lon: f64| {
-            let point = zone.from_geo(placeformer_core::types::GeoPoint::new(48.0, lon).unwrap());
-            format!(
-                "@{:.2}@{:.2}@{}@U@@@@@@@@@@@.jpg",
-                point.east, point.north, zone.number
-            )
-        };
-        let west = name(
-            UtmZone {
-                number: 31,
-                band: 'U',
-            },
-            5.99995,
-        );
-        let east = name(
-            UtmZone {
-                number: 32,
-                band: 'U',
-            },
-            6.00005,
-        );
-        write(
-            root.path(),
-            &[
-                &format!("images/test/database/{west}"),
-                &format!("images/test/queries/{east}"),
-            ],
-        );
-        let dataset =
-            load_dataset(DatasetKind::Utm, root.path(), &DatasetOptions::default()).unwrap();
-        assert_eq!(dataset.truth, [Truth::Positives(vec![0])]);
-        assert_eq!(dataset.notes.len(), 1);
-    }
-
-    fn name_at(zone: UtmZone, lat: f64, lon: f64, north: f64) -> String {
-        let point = zone.from_geo(placeformer_core::types::GeoPoint::new(lat, lon).unwrap());
-        format!(
-            "@{:.2}@{:.2}@{}@{}@@@@@@@@@@@.jpg",
-            point.east,
-            point.north + north,
-            zone.number,
-            zone.band
-        )
-    }
-
-    #[test]
-    fn far_zones_keep_their_metres_and_never_meet() {
-        let root = tempfile::tempdir().unwrap();
-        let (copenhagen, francisco) = (
-            UtmZone {
-                number: 33,
-                band: 'U',
-            },
-            UtmZone {
-                number: 10,
-                band: 'S',
-            },
-        );
-        let names = [
-            format!(
-                "images/val/database/{}",
-                name_at(copenhagen, 55.67, 12.57, 0.0)
-            ),
-            format!(
-                "images/val/database/{}",
-                name_at(francisco, 37.77, -122.42, 0.0)
-            ),
-            format!(
-                "images/val/queries/{}",
-                name_at(copenhagen, 55.67, 12.57, 20.0)
-            ),
-            format!(
-                "images/val/queries/{}",
-                name_at(francisco, 37.77, -122.42, 20.0)
-            ),
-            // Copenhagen's coordinates under San Francisco's number.
-            format!(
-                "images/val/queries/{}",
-                name_at(copenhagen, 55.67, 12.57, 0.0).replace("@33@U", "@10@S")
-            ),
-        ];
-        write(root.path(), &names.each_ref().map(String::as_str));
-        let options = DatasetOptions {
-            split: Some(Split::Val),
-            ..Default::default()
-        };
-        let dataset = load_dataset(DatasetKind::MslsVal, root.path(), &options).unwrap();
-        for (query, truth) in dataset.queries.iter().zip(&dataset.truth) {
-            let expected: Vec<usize> = (0..2)
-                .filter(|&index| {
-                    let (a, b) = (
-                        dataset.database[index].position.unwrap(),
-                        query.position.unwrap(),
-                    );
-                    let same = dataset.database[index].group == query.group;
-                    same && (a.east - b.east).hypot(a.north - b.north) < 25.0
-                })
-                .collect();
-            assert_eq!(*truth, Truth::from_positives(expected), "{}", query.name);
-        }
-        assert_eq!(
-            dataset
-                .truth
-                .iter()
-                .filter(|truth| !truth.positives().is_empty())
-                .count(),
-            2
-        );
-        let groups: std::collections::BTreeSet<_> =
-            dataset.queries.iter().map(|q| q.group.as_deref()).collect();
-        assert_eq!(
-            groups.into_iter().collect::<Vec<_>>(),
-            [Some("zone 10 north"), Some("zone 33 north")]
-        );
-    }
-
-    #[test]
-    fn splits_are_found_without_an_images_folder_and_missing_view_angles_are_counted() {
-        let root = tempfile::tempdir().unwrap();
-        let at = |heading: &str| format!("@0500000.00@4000000.00@17@T@@@@@{heading}@@@@@@.jpg");
-        write(
-            root.path(),
-            &[
-                &format!("val/database/{}", at("010")),
-                &format!("val/queries/{}", at("020")),
-                &format!("val/queries/{}", at("")),
-                &format!("train/database/{}", at("200")),
-                &format!("train/queries/{}", at("020")),
-            ],
-        );
-        let load = |split| {
-            let options = DatasetOptions {
-                split: Some(split),
-                ..Default::default()
-            };
-            load_dataset(DatasetKind::MslsVal, root.path(), &options).unwrap()
-        };
-        let val = load(Split::Val);
-        assert_eq!(
-            val.truth,
-            [Truth::Positives(vec![0]), Truth::Positives(vec![0])]
-        );
-        assert!(
-            val.notes
-                .iter()
-                .any(|note| note.contains("1 images have no view angle")),
-            "{:?}",
-            val.notes
-        );
-        let train = load(Split::Train);
-        assert_eq!(train.truth, [Truth::NoMatch]);
-        assert!(
-            !train
-                .notes
-                .iter()
-                .any(|note| note.contains("no view angle")),
-            "{:?}",
-            train.notes
-        );
-    }
-
-    #[test]
-    fn names_without_a_zone_belong_to_the_only_plane_or_to_none() {
-        let root = tempfile::tempdir().unwrap();
-        let bare = "images/test/queries/@500000@4000000@.jpg";
-        write(
-            root.path(),
-            &["images/test/database/@500000@4000000@17@T@.jpg", bare],
-        );
-        let load =
-            || load_dataset(DatasetKind::Utm, root.path(), &DatasetOptions::default()).unwrap();
-        assert_eq!(load().truth, [Truth::Positives(vec![0])]);
-        write(
-            root.path(),
-            &["images/test/database/@500000@4000000@40@T@.jpg"],
-        );
-        let apart = load();
-        assert_eq!(apart.truth, [Truth::NoMatch]);
-        assert!(
-            apart
-                .notes
-                .iter()
-                .any(|note| note.starts_with("1 images name no zone")),
-            "{:?}",
-            apart.notes
-        );
-    }
-
-    #[test]
-    fn a_wrong_root_says_what_is_expected() {
-        let root = tempfile::tempdir().unwrap();
-        let error = load_dataset(
-            DatasetKind::Tokyo247,
-            root.path(),
-            &DatasetOptions::default(),
-        )
-        .unwrap_err();
-        assert!(
-            error.to_string().contains("images/{train,val,test}"),
-            "{error}"
-        );
-    }
-}
+mod tests;

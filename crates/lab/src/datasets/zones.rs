@@ -89,7 +89,8 @@ impl Zones {
             .iter()
             .filter(|cluster| cluster.numbers.len() > 1)
             .map(|cluster| {
-                let (name, target) = (cluster.name(), cluster.target().number);
+                let name = cluster.name();
+                let target = cluster.target().number;
                 format!("positions in {name} are projected into zone {target}")
             })
             .collect();
@@ -193,7 +194,8 @@ mod tests {
                 .project(zone, zone.from_geo(GeoPoint::new(-18.0, lon).unwrap()))
                 .unwrap()
         };
-        let (west, east) = (place("60K", 179.9999), place("1K", -179.9999));
+        let west = place("60K", 179.9999);
+        let east = place("1K", -179.9999);
         let metres = (west.east - east.east).hypot(west.north - east.north);
         // 0.0002 degrees of longitude at 18 degrees south.
         assert!((metres - 21.2).abs() < 0.5, "{metres}");
@@ -211,7 +213,8 @@ mod tests {
             let zones = Zones::of(neighbours.into_iter().map(next).chain([own]));
             let a = own.from_geo(point);
             let b = MetricPoint { east: a.east + east, north: a.north + north };
-            let (p, q) = (zones.project(own, a).unwrap(), zones.project(own, b).unwrap());
+            let p = zones.project(own, a).unwrap();
+            let q = zones.project(own, b).unwrap();
             let projected = (p.east - q.east).hypot(p.north - q.north);
             prop_assert!((projected - east.hypot(north)).abs() <= 0.02 * east.hypot(north) + 0.05, "{projected}");
         }

@@ -1,7 +1,7 @@
 //! A tiny-skia surface with the few marks these pictures need: images, squares, lines, dots and
 //! score labels.
 
-use super::DrawError;
+use super::error::DrawError;
 use placeformer_core::types::ImageSize;
 use placeformer_vision::image::RgbImage;
 use tiny_skia::{
@@ -37,12 +37,8 @@ impl Canvas {
     pub(super) fn place(&mut self, image: &RgbImage, panel: Panel) {
         let stride = self.0.width() as usize;
         let width = panel.size.width as usize;
-        for (row, rgb_row) in image
-            .pixels
-            .chunks_exact(width * 3)
-            .take(panel.size.height as usize)
-            .enumerate()
-        {
+        let rows = image.pixels.chunks_exact(width * 3);
+        for (row, rgb_row) in rows.take(panel.size.height as usize).enumerate() {
             let start = (panel.top as usize + row) * stride + panel.left as usize;
             let out = &mut self.0.pixels_mut()[start..start + width];
             for (out, rgb) in out.iter_mut().zip(rgb_row.chunks_exact(3)) {

@@ -1,7 +1,7 @@
 //! The two pictures, laid out in panels.
 
-use super::DrawError;
 use super::canvas::{Canvas, Panel, Rgba};
+use super::error::DrawError;
 use placeformer_core::types::{ImageSize, PackedPatches, SCALES, ScaleSet};
 use placeformer_vision::image::RgbImage;
 
@@ -14,7 +14,7 @@ const GAP: u32 = 8;
 /// Height of the label above a row of lines.
 const CAPTION: u32 = 24;
 const BACKGROUND: [u8; 3] = [20, 22, 27];
-/// Scales 1, 2, 3: told apart by hue, by lightness and by size.
+/// Scales 1, 2, 3, which differ in hue, in lightness and in size.
 const SCALE_COLOURS: [Rgba; SCALES] = [
     [86, 214, 255, 235],
     [255, 196, 61, 240],
@@ -42,7 +42,7 @@ pub struct AttentionMap<'a> {
 
 /// One of the two images of a match.
 #[derive(Debug, Clone, Copy)]
-pub struct MatchSide<'a> {
+pub struct DrawnSide<'a> {
     /// The photo, of any size.
     pub image: &'a RgbImage,
     /// Its attention, where it is at hand.
@@ -69,18 +69,72 @@ pub struct CombinationLines<'a> {
 /// An image without pixels, an attention map that does not fill its grid, or an inlier that names
 /// no patch.
 pub fn match_picture(
-    query: &MatchSide,
-    reference: &MatchSide,
+    query: &DrawnSide,
+    reference: &DrawnSide,
     combinations: &[CombinationLines],
 ) -> Result<RgbImage, DrawError> {
-    let widths = [panel_width(query.image)?, panel_width(reference.image)?];
-    let line_row = CAPTION + PANEL_HEIGHT + GAP;
-    let size = ImageSize {
-        width: widths[0] + widths[1] + 3 * GAP,
-        height: GAP + PANEL_HEIGHT + GAP + line_row * combinations.len() as u32,
+    let layout = Layout {
+        widths: [panel_width(query.image)?, panel_width(reference.image)?],
     };
-    let mut canvas = Canvas::new(size, BACKGROUND)?;
-    let panels = |top: u32| {
+    let mut canvas = Canvas::new(layout.size(combinations.len()), BACKGROUND)?;
+    let top = layout.panels(GAP);
+    let photos = [
+        query.image.resized(top[0].size)?,
+        reference.image.resized(top[1].size)?,
+    ];
+
+    for ((side, panel), photo) in [query, reference].into_iter().zip(top).zip(&photos) {
+        match side.attention {
+            Some(attention) => canvas.place(&heated(photo, attention)?, panel),
+            None => canvas.place(photo, panel),
+        }
+        draw_patches(&mut canvas, side.patches, panel);
+    }
+
+    let patches = [query.patches, reference.patches];
+    for (row, combination) in combinations.iter().enumerate() {
+        let caption_top = layout.caption_top(row);
+        let colour = LINE_COLOURS[row % LINE_COLOURS.len()];
+        let caption = format!(
+            "{} {}/{}",
+            combination.scales.score_name(),
+            combination.inliers.len(),
+            combination.matches
+        );
+        canvas.label(&caption, GAP as f32, caption_top as f32 + 4.0, 2.0, colour);
+        let panels = layout.panels(caption_top + CAPTION);
+        for (photo, panel) in photos.iter().zip(panels) {
+            canvas.place(photo, panel);
+        }
+        draw_lines(&mut canvas, patches, panels, combination.inliers, colour)?;
+    }
+    Ok(canvas.finish())
+}
+
+/// Where the panels of a picture of a match lie: a row of two, then a caption and a row of two for
+/// each combination.
+struct Layout {
+    /// Widths of the query's and the reference's panels in pixels.
+    widths: [u32; 2],
+}
+
+impl Layout {
+    /// Height of a caption and the row below it.
+    const LINE_ROW: u32 = CAPTION + PANEL_HEIGHT + GAP;
+
+    fn size(&self, combinations: usize) -> ImageSize {
+        ImageSize {
+            width: self.widths[0] + self.widths[1] + 3 * GAP,
+            height: self.caption_top(combinations),
+        }
+    }
+
+    /// Top of the caption of a combination, by its number.
+    fn caption_top(&self, row: usize) -> u32 {
+        GAP + PANEL_HEIGHT + GAP + row as u32 * Self::LINE_ROW
+    }
+
+    fn panels(&self, top: u32) -> [Panel; 2] {
         let panel = |left, width| Panel {
             left,
             top,
@@ -89,45 +143,12 @@ pub fn match_picture(
                 height: PANEL_HEIGHT,
             },
         };
-        [panel(GAP, widths[0]), panel(2 * GAP + widths[0], widths[1])]
-    };
-    let sides = [query, reference];
-    let top = panels(GAP);
-    let small = [
-        query.image.resized(top[0].size)?,
-        reference.image.resized(top[1].size)?,
-    ];
-    for ((side, panel), small) in sides.into_iter().zip(top).zip(&small) {
-        match side.attention {
-            Some(attention) => canvas.place(&heated(small, attention)?, panel),
-            None => canvas.place(small, panel),
-        }
-        draw_patches(&mut canvas, side.patches, panel);
+        let reference_left = 2 * GAP + self.widths[0];
+        [
+            panel(GAP, self.widths[0]),
+            panel(reference_left, self.widths[1]),
+        ]
     }
-    for (row, combination) in combinations.iter().enumerate() {
-        let caption_top = GAP + PANEL_HEIGHT + GAP + row as u32 * line_row;
-        let colour = LINE_COLOURS[row % LINE_COLOURS.len()];
-        let text = format!(
-            "{} {}/{}",
-            combination.scales.score_name(),
-            combination.inliers.len(),
-            combination.matches
-        );
-        canvas.label(&text, GAP as f32, caption_top as f32 + 4.0, 2.0, colour);
-        let row_panels = panels(caption_top + CAPTION);
-        small
-            .iter()
-            .zip(row_panels)
-            .for_each(|(small, panel)| canvas.place(small, panel));
-        draw_lines(
-            &mut canvas,
-            [query.patches, reference.patches],
-            row_panels,
-            combination.inliers,
-            colour,
-        )?;
-    }
-    Ok(canvas.finish())
 }
 
 /// `image` at its own size under its attention as heat.
@@ -141,13 +162,14 @@ pub fn attention_picture(image: &RgbImage, attention: AttentionMap) -> Result<Rg
     heated(image, attention)
 }
 
+/// Width of the panel of a photo, which keeps its shape.
 fn panel_width(image: &RgbImage) -> Result<u32, DrawError> {
     let ImageSize { width, height } = image.size;
     if width == 0 || height == 0 {
         return Err(DrawError::Size(image.size));
     }
     let width = u64::from(width) * u64::from(PANEL_HEIGHT) / u64::from(height);
-    // Clamped to a three-digit number.
+    // The clamp makes it a number of three digits, so the cast loses nothing.
     Ok(width.clamp(16, u64::from(PANEL_MAX_WIDTH)) as u32)
 }
 
@@ -158,6 +180,7 @@ fn on_canvas(patches: &PackedPatches, row: usize, panel: Panel) -> [f32; 2] {
     [panel.left as f32 + x * across, panel.top as f32 + y * down]
 }
 
+/// Pixels of the canvas for a pixel of the model input, across and down.
 fn pixels_per_input_pixel(patches: &PackedPatches, panel: Panel) -> [f32; 2] {
     let input = |count: u16| f32::from(count) * f32::from(patches.grid.patch_px);
     [
@@ -166,6 +189,7 @@ fn pixels_per_input_pixel(patches: &PackedPatches, panel: Panel) -> [f32; 2] {
     ]
 }
 
+/// Outlines every key patch in the colour and the size of its scale.
 fn draw_patches(canvas: &mut Canvas, patches: &PackedPatches, panel: Panel) {
     let [across, down] = pixels_per_input_pixel(patches, panel);
     for scale in 1..=SCALES {
@@ -182,6 +206,7 @@ fn draw_patches(canvas: &mut Canvas, patches: &PackedPatches, panel: Panel) {
     }
 }
 
+/// Draws a line for every inlier, with dots at its ends.
 fn draw_lines(
     canvas: &mut Canvas,
     patches: [&PackedPatches; 2],
@@ -232,18 +257,14 @@ fn heated(image: &RgbImage, attention: AttentionMap) -> Result<RgbImage, DrawErr
     }
     // A few patches (often sky or lens artefacts) tower above the rest: the 98th percentile is
     // already full heat.
-    let mut sorted: Vec<f32> = values
-        .iter()
-        .copied()
-        .filter(|value| value.is_finite())
-        .collect();
+    let finite = values.iter().copied().filter(|value| value.is_finite());
+    let mut sorted: Vec<f32> = finite.collect();
     sorted.sort_by(f32::total_cmp);
-    let peak = sorted
-        .get((sorted.len() * 98).div_ceil(100).saturating_sub(1))
-        .copied()
-        .unwrap_or(0.0)
-        .max(f32::MIN_POSITIVE);
-    let (width, height) = (image.size.width as usize, image.size.height as usize);
+    let rank = (sorted.len() * 98).div_ceil(100).saturating_sub(1);
+    let peak = sorted.get(rank).copied().unwrap_or(0.0);
+    let peak = peak.max(f32::MIN_POSITIVE);
+    let width = image.size.width as usize;
+    let height = image.size.height as usize;
     let mut pixels = Vec::with_capacity(image.pixels.len());
     for (at, rgb) in image.pixels.chunks_exact(3).enumerate() {
         let x = ((at % width) as f32 + 0.5) / width as f32 * columns as f32 - 0.5;
@@ -251,8 +272,9 @@ fn heated(image: &RgbImage, attention: AttentionMap) -> Result<RgbImage, DrawErr
         let heat = (interpolate(attention, x, y) / peak).clamp(0.0, 1.0).sqrt();
         let colour = heat_colour(heat);
         let share = 0.25 + 0.4 * heat;
-        pixels
-            .extend((0..3).map(|c| (f32::from(rgb[c]) * (1.0 - share) + colour[c] * share) as u8));
+        for (value, heat) in rgb.iter().zip(colour) {
+            pixels.push((f32::from(*value) * (1.0 - share) + heat * share) as u8);
+        }
     }
     Ok(RgbImage {
         size: image.size,
@@ -262,13 +284,15 @@ fn heated(image: &RgbImage, attention: AttentionMap) -> Result<RgbImage, DrawErr
 
 /// The map between patch centres, at `x`, `y` in patches.
 fn interpolate(attention: AttentionMap, x: f32, y: f32) -> f32 {
-    let (left, top) = (x.floor(), y.floor());
+    let left = x.floor();
+    let top = y.floor();
     let at = |column: f32, row: f32| {
         let column = column.clamp(0.0, (attention.columns - 1) as f32) as usize;
         let row = row.clamp(0.0, (attention.rows - 1) as f32) as usize;
         attention.values[row * attention.columns + column]
     };
-    let (fx, fy) = (x - left, y - top);
+    let fx = x - left;
+    let fy = y - top;
     let upper = at(left, top) * (1.0 - fx) + at(left + 1.0, top) * fx;
     let lower = at(left, top + 1.0) * (1.0 - fx) + at(left + 1.0, top + 1.0) * fx;
     upper * (1.0 - fy) + lower * fy
@@ -291,145 +315,4 @@ fn heat_colour(heat: f32) -> [f32; 3] {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use half::f16;
-    use placeformer_core::types::{PatchGrid, PoolingStride};
-
-    fn patches(index: Vec<u16>, counts: [usize; 3]) -> PackedPatches {
-        let n = index.len();
-        let grid = PatchGrid {
-            columns: 32,
-            rows: 24,
-            patch_px: 14,
-            stride: PoolingStride::Kernel,
-        };
-        let (attention, factor, codes) = (vec![f16::ONE; n], vec![1.0; n], vec![1; n]);
-        PackedPatches {
-            grid,
-            dim: 1,
-            counts,
-            index,
-            attention,
-            factor,
-            codes,
-        }
-    }
-
-    fn grey() -> RgbImage {
-        RgbImage::filled(
-            ImageSize {
-                width: 640,
-                height: 480,
-            },
-            [60, 60, 60],
-        )
-    }
-
-    #[test]
-    fn rows_and_panels_add_up_and_lines_join_the_patches() {
-        let (image, patches) = (grey(), patches(vec![32 * 12 + 16, 0], [1, 1, 0]));
-        let side = MatchSide {
-            image: &image,
-            attention: None,
-            patches: &patches,
-        };
-        let scales: ScaleSet = "1+2".parse().unwrap();
-        let lines = CombinationLines {
-            scales,
-            matches: 9,
-            inliers: &[(0, 0)],
-        };
-        let picture = match_picture(&side, &side, &[lines, lines]).unwrap();
-        assert_eq!(
-            picture.size,
-            ImageSize {
-                width: 480 * 2 + 24,
-                height: 8 + 360 + 8 + 2 * 392
-            }
-        );
-        // The patch lies at 231, 175 of 448 x 336, so at 247.5, 187.5 of a panel of 480 x 360.
-        let top = 8 + 360 + 8 + 24;
-        let (left_x, right_x, y) = (8 + 247, 16 + 480 + 247, top + 187);
-        assert_eq!(picture.pixel(left_x, y), [94, 231, 138]);
-        assert_eq!(picture.pixel(right_x, y), [94, 231, 138]);
-        let between = picture.pixel((left_x + right_x) / 2, y);
-        assert!(between[1] > 150 && between[0] < between[1], "{between:?}");
-        assert_eq!(picture.pixel(left_x, y + 40), [60, 60, 60]);
-        assert_eq!(picture.pixel(left_x, y + 392), [255, 179, 71]);
-    }
-
-    #[test]
-    fn key_patches_are_outlined_in_the_colour_of_their_scale() {
-        let (image, patches) = (grey(), patches(vec![0, 15], [0, 1, 1]));
-        let side = MatchSide {
-            image: &image,
-            attention: None,
-            patches: &patches,
-        };
-        let picture = match_picture(&side, &side, &[]).unwrap();
-        // The first 2x2 window spans 30 x 30 pixels of the panel at 8, 8; its outline is inset by
-        // 1.5.
-        let edge = picture.pixel(8 + 15, 8 + 1);
-        assert!(edge[0] > 150 && edge[2] < 120, "{edge:?}");
-        assert_eq!(picture.pixel(8 + 15, 8 + 15), [60, 60, 60]);
-    }
-
-    #[test]
-    fn heat_is_where_the_attention_is() {
-        let mut values = vec![0.1; 12];
-        values[5] = 5.0;
-        let picture = attention_picture(
-            &grey(),
-            AttentionMap {
-                values: &values,
-                columns: 4,
-                rows: 3,
-            },
-        )
-        .unwrap();
-        let (hot, cold) = (picture.pixel(240, 240), picture.pixel(600, 440));
-        assert!(hot[0] > cold[0] + 60, "{hot:?} {cold:?}");
-    }
-
-    #[test]
-    fn what_does_not_fit_is_refused() {
-        let (image, patches) = (grey(), patches(vec![0], [1, 0, 0]));
-        let map = AttentionMap {
-            values: &[1.0; 5],
-            columns: 2,
-            rows: 3,
-        };
-        assert!(matches!(
-            attention_picture(&image, map),
-            Err(DrawError::AttentionShape { values: 5, .. })
-        ));
-        let side = MatchSide {
-            image: &image,
-            attention: None,
-            patches: &patches,
-        };
-        let lines = CombinationLines {
-            scales: "1".parse().unwrap(),
-            matches: 1,
-            inliers: &[(0, 1)],
-        };
-        let error = match_picture(&side, &side, &[lines]).unwrap_err();
-        assert_eq!(error, DrawError::NoSuchPatch { row: 1, patches: 1 });
-        let empty = RgbImage {
-            size: ImageSize {
-                width: 0,
-                height: 3,
-            },
-            pixels: vec![],
-        };
-        let side = MatchSide {
-            image: &empty,
-            ..side
-        };
-        assert!(matches!(
-            match_picture(&side, &side, &[]),
-            Err(DrawError::Size(_))
-        ));
-    }
-}
+mod tests;

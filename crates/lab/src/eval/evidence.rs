@@ -1,8 +1,8 @@
 //! Why two images were found to match, or not: everything the picture of a match needs, computed
 //! anew for one pair.
 
-use super::EvalError;
-use crate::draw::{AttentionMap, CombinationLines, MatchSide, match_picture};
+use super::error::EvalError;
+use crate::draw::{AttentionMap, CombinationLines, DrawnSide, match_picture};
 use placeformer_core::types::PackedPatches;
 use placeformer_vision::extract::Extractor;
 use placeformer_vision::extract::pack;
@@ -23,6 +23,9 @@ pub struct Seen {
 
 impl Seen {
     /// Runs the model on one image and keeps what a picture needs.
+    ///
+    /// # Errors
+    /// The image cannot be decoded, or the model fails.
     pub fn new(
         extractor: &Extractor,
         limits: &ImageConfig,
@@ -37,15 +40,16 @@ impl Seen {
         })
     }
 
-    fn side(&self) -> MatchSide<'_> {
+    fn side(&self) -> DrawnSide<'_> {
         let grid = self.patches.grid;
-        let (columns, rows) = (usize::from(grid.columns), usize::from(grid.rows));
+        let columns = usize::from(grid.columns);
+        let rows = usize::from(grid.rows);
         let attention = Some(AttentionMap {
             values: &self.attention,
             columns,
             rows,
         });
-        MatchSide {
+        DrawnSide {
             image: &self.image,
             attention,
             patches: &self.patches,
@@ -54,6 +58,9 @@ impl Seen {
 }
 
 /// Both images side by side with attention and key patches, and the inliers of every combination.
+///
+/// # Errors
+/// An image has no pixels, or a match names a patch that is not there.
 pub fn picture(
     query: &Seen,
     reference: &Seen,

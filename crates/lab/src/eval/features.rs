@@ -3,125 +3,56 @@
 //!
 //! A record is found by the model's identity, what a fixed picture gives on this machine, and the
 //! hash of the image's content: renaming or copying images costs nothing, changing one image, one
-//! setting or one rounding of a kernel recomputes just what it must. Records are written beside
-//! their place and renamed into it, and carry a checksum: a half-written or damaged one is as good
-//! as none. An image that cannot be read is listed with its reason and takes no part; it never
-//! vanishes in silence.
+//! setting or one rounding of a kernel recomputes just what it must. Records are written under
+//! another name and then renamed, and carry a checksum: a half-written or damaged one is treated as
+//! if there were none. An image that cannot be read is listed with its reason and takes no part.
 
-use super::EvalError;
+mod describe;
+mod record;
+
+pub use describe::{Describe, ModelDescriber};
+pub use record::ExtractionSeconds;
+
+use super::error::EvalError;
+use crate::choice::Choice;
 use crate::datasets::Item;
-use indicatif::ProgressBar;
-use placeformer_core::types::{
-    ContentHash, Descriptor, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches,
-};
-use placeformer_store::codec;
-use placeformer_vision::extract::Extractor;
-use placeformer_vision::image::{ImageConfig, RgbImage, encode_jpeg, load_tensor};
+use placeformer_core::progress::Task;
+use placeformer_core::types::{ContentHash, ImageTensor, PackedPatches};
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 use rayon::prelude::*;
+use record::Record;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// What turns image bytes into descriptors.
-pub trait Describe: Sync {
-    /// Identity of everything the descriptors depend on.
-    fn model(&self) -> &ModelId;
-    /// The name of what computes them, for people.
-    fn computed_by(&self) -> String;
-    /// A hash of what a fixed picture gives, from its bytes on. Descriptors of one model compare
-    /// whatever computed them, but a measurement must not mix those of two builds whose kernels,
-    /// decoder or resizing differ.
-    fn fingerprint(&self) -> Result<ContentHash, EvalError>;
-    /// Decodes and normalises; the error says what is wrong with the image.
-    fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String>;
-    /// One descriptor per image.
-    fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, EvalError>;
-    /// The key patches of an image in full precision.
-    fn key_patches(&self, image: &ImageTensor) -> Result<KeyPatches, EvalError>;
-}
-
-/// The model at work.
-pub struct ModelDescriber {
-    /// The model.
-    pub extractor: Extractor,
-    /// Limits on images.
-    pub limits: ImageConfig,
-}
-
-impl Describe for ModelDescriber {
-    fn model(&self) -> &ModelId {
-        self.extractor.model_id()
-    }
-
-    fn computed_by(&self) -> String {
-        self.extractor.encoder_name()
-    }
-
-    fn fingerprint(&self) -> Result<ContentHash, EvalError> {
-        let setting = |error: String| {
-            EvalError::Setting(format!("the picture that tells builds apart: {error}"))
-        };
-        let picture = encode_jpeg(&probe_picture(self.extractor.input_size()), 90);
-        let bytes = picture.map_err(|error| setting(error.to_string()))?;
-        let descriptor = self
-            .describe(&[self.tensor(&bytes).map_err(setting)?])?
-            .pop();
-        let descriptor = descriptor.ok_or_else(|| setting("no descriptor".into()))?;
-        let mut untimed = Record {
-            seconds: ExtractionSeconds::default(),
-            blob_bytes: 0,
-            descriptor,
-        };
-        Ok(ContentHash::of(&untimed.encode()?))
-    }
-
-    fn tensor(&self, bytes: &[u8]) -> Result<ImageTensor, String> {
-        load_tensor(bytes, &self.limits, self.extractor.input_size())
-            .map_err(|error| error.to_string())
-    }
-
-    fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, EvalError> {
-        Ok(self.extractor.extract(images)?)
-    }
-
-    fn key_patches(&self, image: &ImageTensor) -> Result<KeyPatches, EvalError> {
-        let described = self
-            .extractor
-            .extract_full(std::slice::from_ref(image))?
-            .pop();
-        described
-            .map(|(_, patches)| patches)
-            .ok_or_else(|| EvalError::Setting("one image gave no descriptor".into()))
-    }
-}
-
-/// Waves and steps of all three colours, half as large again as the model's input so that it is
-/// resized.
-fn probe_picture(input: ImageSize) -> RgbImage {
-    let size = ImageSize {
-        width: input.width * 3 / 2,
-        height: input.height * 3 / 2,
-    };
-    let pixel = |x: u32, y: u32| {
-        [x * 7 + y, (x / 24 * 50) ^ (y / 40 * 90), x * y / 64].map(|value| (value % 256) as u8)
-    };
-    let pixels = (0..size.height)
-        .flat_map(|y| (0..size.width).flat_map(move |x| pixel(x, y)))
-        .collect();
-    RgbImage { size, pixels }
-}
-
 /// Which vector is searched.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum GlobalKind {
     /// The global descriptor as the head makes it.
     Head,
     /// The mean patch token before the head.
     Mean,
+}
+
+impl Choice for GlobalKind {
+    const ALL: &'static [Self] = &[Self::Head, Self::Mean];
+
+    fn as_str(self) -> &'static str {
+        match self {
+            Self::Head => "head",
+            Self::Mean => "mean",
+        }
+    }
+
+    fn description(self) -> &'static str {
+        match self {
+            Self::Head => "The global descriptor as the head makes it",
+            Self::Mean => "The mean patch token before the head",
+        }
+    }
 }
 
 /// An image that could not be used.
@@ -133,15 +64,6 @@ pub struct Unreadable {
     pub side: &'static str,
     /// Why.
     pub reason: String,
-}
-
-/// Mean seconds per image of the stages before the search.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
-pub struct ExtractionSeconds {
-    /// Decoding and resizing.
-    pub decode: f64,
-    /// The model.
-    pub extract: f64,
 }
 
 /// Descriptors of one side of a data set: global vectors in memory, key patches on disk behind a
@@ -213,6 +135,9 @@ const BATCH: usize = 4;
 impl FeatureCache {
     /// Opens (and creates) what `describer` recorded below `root`, holding at most `memory_bytes`
     /// of key patches.
+    ///
+    /// # Errors
+    /// The folder cannot be written, or the model fails on the picture that identifies the build.
     pub fn open(
         root: &Path,
         describer: &dyn Describe,
@@ -236,13 +161,16 @@ impl FeatureCache {
     }
 
     /// Describes `items`, taking from disk what is there.
+    ///
+    /// # Errors
+    /// The model fails, or a record cannot be written. Images that cannot be read are no error.
     pub fn describe_all(
         &self,
         describer: &dyn Describe,
         items: &[Item],
         side: &'static str,
         kind: GlobalKind,
-        progress: &ProgressBar,
+        task: &Task<'_>,
     ) -> Result<Features, EvalError> {
         let mut all = Collected::default();
         for chunk in items.chunks(CHUNK) {
@@ -254,12 +182,15 @@ impl FeatureCache {
             for (item, result) in chunk.iter().zip(found) {
                 all.add(item, side, kind, result)?;
             }
-            progress.inc(chunk.len() as u64);
+            task.add(chunk.len() as u64);
         }
         all.finish(items.len())
     }
 
     /// Key patches of image `index` of a side this cache described.
+    ///
+    /// # Errors
+    /// The image was unreadable, or its record vanished during the run.
     pub fn patches(
         &self,
         features: &Features,
@@ -307,7 +238,8 @@ impl FeatureCache {
             .filter(|&i| matches!(found[i], Ok(Loaded::Decoded(..))))
             .collect();
         for batch in missing.chunks(BATCH) {
-            let (mut slots, mut tensors) = (Vec::new(), Vec::new());
+            let mut slots = Vec::new();
+            let mut tensors = Vec::new();
             for &index in batch {
                 if let Ok(Loaded::Decoded(hash, tensor, decode)) =
                     std::mem::replace(&mut found[index], Err(String::new()))
@@ -344,7 +276,10 @@ impl FeatureCache {
         let bytes = std::fs::read(self.path(hash)).ok()?;
         let record = Record::decode(&bytes);
         if record.is_none() {
-            tracing::warn!(image = %hash, "a cached feature record is damaged; it is computed anew");
+            tracing::warn!(
+                image = %hash,
+                "a cached feature record is damaged; it is computed anew"
+            );
         }
         record
     }
@@ -440,74 +375,6 @@ impl Collected {
                 extract: self.extract / readable,
             },
             fresh: self.fresh,
-        })
-    }
-}
-
-/// A descriptor with what it cost.
-#[derive(Debug, Clone, PartialEq)]
-struct Record {
-    seconds: ExtractionSeconds,
-    /// Length of the encoded key patches.
-    blob_bytes: usize,
-    descriptor: Descriptor,
-}
-
-const MAGIC: &[u8; 8] = b"PFFEAT01";
-const HEADER: usize = 8 + 2 * 8 + 2 * 4;
-
-impl Record {
-    /// Magic, seconds, lengths, global and pooled vectors, key patches as the store encodes them,
-    /// CRC-32 of it all.
-    fn encode(&mut self) -> Result<Vec<u8>, EvalError> {
-        let blob = codec::encode(&self.descriptor.patches)
-            .map_err(|error| EvalError::Setting(error.to_string()))?;
-        self.blob_bytes = blob.len();
-        let mut bytes = MAGIC.to_vec();
-        bytes.extend(self.seconds.decode.to_le_bytes());
-        bytes.extend(self.seconds.extract.to_le_bytes());
-        bytes.extend((self.descriptor.global.len() as u32).to_le_bytes());
-        bytes.extend((self.descriptor.pooled.len() as u32).to_le_bytes());
-        for value in self.descriptor.global.iter().chain(&self.descriptor.pooled) {
-            bytes.extend(value.to_le_bytes());
-        }
-        bytes.extend(blob);
-        bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
-        Ok(bytes)
-    }
-
-    /// None unless every byte is as it was written.
-    fn decode(bytes: &[u8]) -> Option<Self> {
-        let (content, checksum) = bytes.split_last_chunk::<4>()?;
-        if crc32fast::hash(content) != u32::from_le_bytes(*checksum) || !content.starts_with(MAGIC)
-        {
-            return None;
-        }
-        let number = |at: usize| {
-            Some(f64::from_le_bytes(
-                content.get(at..at + 8)?.try_into().ok()?,
-            ))
-        };
-        let length = |at: usize| {
-            Some(u32::from_le_bytes(content.get(at..at + 4)?.try_into().ok()?) as usize)
-        };
-        let (global, pooled) = (length(24)?, length(28)?);
-        let vectors = content.get(HEADER..HEADER.checked_add(4 * global.checked_add(pooled)?)?)?;
-        let mut values = vectors
-            .chunks_exact(4)
-            .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-        let blob = content.get(HEADER + vectors.len()..)?;
-        Some(Self {
-            seconds: ExtractionSeconds {
-                decode: number(8)?,
-                extract: number(16)?,
-            },
-            blob_bytes: blob.len(),
-            descriptor: Descriptor {
-                global: values.by_ref().take(global).collect(),
-                pooled: values.collect(),
-                patches: codec::decode(blob).ok()?,
-            },
         })
     }
 }

@@ -1,21 +1,31 @@
-//! Recall on data sets: readers, measures, reports.
+//! Recall on data sets: measures and reports.
 //!
-//! [`datasets`](crate::datasets) turns the layouts people have into one shape; [`features`] describes every image
-//! and keeps the result on disk; [`run`] searches and re-ranks as the service does; [`measure`]
-//! holds the numbers as pure functions; [`summary`] gathers them into one value, which [`report`]
-//! prints and draws. [`ablate`] repeats it along the axes of the paper's tables; [`calibrate`]
-//! learns from the answers how far they can be trusted.
+//! | module | holds |
+//! |---|---|
+//! | [`features`] | descriptors of every image, kept on disk |
+//! | [`run`] | search and re-ranking of every query, as the service does them |
+//! | [`answers`] | both of these for a whole data set |
+//! | [`own_places`] | what is left out of the database to make a query one without a match |
+//! | [`measure`] | the numbers, as pure functions |
+//! | [`summary`], [`mod@summarise`] | all numbers of a run as one value, and how it is made |
+//! | [`calibrate`] | from answers to how far they can be trusted |
+//! | [`mod@ablate`] | the same along the axes of the paper's tables |
+//! | [`report`], [`evidence`] | text, pages, pictures |
+//! | [`prediction`] | files that the public benchmarks accept |
 
 pub mod ablate;
+pub mod answers;
 pub mod calibrate;
 mod error;
 pub mod evidence;
 pub mod features;
 pub mod measure;
+pub mod own_places;
 mod places;
 pub mod prediction;
 pub mod report;
 pub mod run;
+pub mod summarise;
 pub mod summary;
 
 pub use error::EvalError;

@@ -18,35 +18,16 @@ pub(super) fn places_of(dataset: &Dataset) -> Vec<usize> {
     let references = dataset.database.len();
     let mut sets = Sets::new(references + dataset.queries.len());
     for (query, truth) in dataset.truth.iter().enumerate() {
-        truth
-            .positives()
-            .iter()
-            .for_each(|&positive| sets.join(references + query, positive));
-    }
-    let unmatched = dataset
-        .queries
-        .iter()
-        .enumerate()
-        .filter_map(|(query, item)| {
-            (dataset.truth[query] == Truth::NoMatch).then_some(())?;
-            Some((query, item.position?))
-        });
-    let unmatched: Vec<_> = unmatched.collect();
-    let grid = NeighbourGrid::new(PLACE_M, unmatched.iter().copied());
-    for &(query, position) in &unmatched {
-        for other in grid
-            .within(position)
-            .filter(|&other| dataset.queries[other].group == dataset.queries[query].group)
-        {
-            sets.join(references + query, references + other);
+        for &positive in truth.positives() {
+            sets.join(references + query, positive);
         }
     }
+    join_unmatched(dataset, &mut sets);
+
     let mut members: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for query in 0..dataset.queries.len() {
-        members
-            .entry(sets.root(references + query))
-            .or_default()
-            .push(query);
+        let root = sets.root(references + query);
+        members.entry(root).or_default().push(query);
     }
     let mut places = vec![0; dataset.queries.len()];
     let mut next = 0;
@@ -59,11 +40,34 @@ pub(super) fn places_of(dataset: &Dataset) -> Vec<usize> {
             queries.len()
         };
         for together in queries.chunks(stretch.max(1)) {
-            together.iter().for_each(|&query| places[query] = next);
+            for &query in together {
+                places[query] = next;
+            }
             next += 1;
         }
     }
     places
+}
+
+/// Joins queries without a match that stand together. In `sets` the queries follow the references.
+fn join_unmatched(dataset: &Dataset, sets: &mut Sets) {
+    let references = dataset.database.len();
+    let mut unmatched = Vec::new();
+    for (query, item) in dataset.queries.iter().enumerate() {
+        if dataset.truth[query] == Truth::NoMatch
+            && let Some(position) = item.position
+        {
+            unmatched.push((query, position));
+        }
+    }
+    let grid = NeighbourGrid::new(PLACE_M, unmatched.iter().copied());
+    for &(query, position) in &unmatched {
+        for other in grid.within(position) {
+            if dataset.queries[other].group == dataset.queries[query].group {
+                sets.join(references + query, references + other);
+            }
+        }
+    }
 }
 
 /// Disjoint sets of numbers.
@@ -84,7 +88,8 @@ impl Sets {
     }
 
     fn join(&mut self, a: usize, b: usize) {
-        let (a, b) = (self.root(a), self.root(b));
+        let a = self.root(a);
+        let b = self.root(b);
         self.0[a.max(b)] = a.min(b);
     }
 }
@@ -97,7 +102,9 @@ mod tests {
 
     fn dataset(truth: Vec<Truth>) -> Dataset {
         let items = |n: usize| (0..n).map(|i| Item::new(i.to_string(), "x")).collect();
-        let (queries, skipped, notes) = (items(truth.len()), Vec::new(), Vec::new());
+        let queries = items(truth.len());
+        let skipped = Vec::new();
+        let notes = Vec::new();
         Dataset {
             name: "d".into(),
             database: items(40),

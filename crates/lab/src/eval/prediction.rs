@@ -1,6 +1,6 @@
 //! Files that the public benchmarks accept, where the answers are withheld.
 
-use super::EvalError;
+use super::error::EvalError;
 use super::run::Answer;
 use crate::datasets::{Dataset, Item};
 use std::io::Write;
@@ -15,6 +15,9 @@ const MSLS_ANSWERS: usize = 20;
 /// The official evaluation stops at a query without a line. So a query that could not be read gets
 /// one too, in its place, with the first references of the database; how many there are is
 /// returned.
+///
+/// # Errors
+/// The file cannot be written.
 pub fn write_msls(path: &Path, dataset: &Dataset, answers: &[Answer]) -> Result<usize, EvalError> {
     let mut ranked: Vec<Option<Vec<usize>>> = vec![None; dataset.queries.len()];
     for answer in answers {
@@ -43,6 +46,9 @@ pub fn write_msls(path: &Path, dataset: &Dataset, answers: &[Answer]) -> Result<
 
 /// The visual localisation benchmark's file: `camera/timestamp.jpg qw qx qy qz tx ty tz` of the
 /// world-to-camera transform, here that of the best match.
+///
+/// # Errors
+/// The file cannot be written.
 pub fn write_robotcar(path: &Path, dataset: &Dataset, answers: &[Answer]) -> Result<(), EvalError> {
     let line = |answer: &Answer| {
         let pose = best(answer)
@@ -51,7 +57,8 @@ pub fn write_robotcar(path: &Path, dataset: &Dataset, answers: &[Answer]) -> Res
         let name = &dataset.queries[answer.query].name;
         // The benchmark wants the last two parts: conditions are not told apart.
         let cut = name.rmatch_indices('/').nth(1).map_or(0, |(at, _)| at + 1);
-        let (q, t) = (pose.rotation.quaternion(), pose.translation());
+        let q = pose.rotation.quaternion();
+        let t = pose.translation();
         Some(format!(
             "{} {} {} {} {} {} {} {}",
             &name[cut..],

@@ -1,10 +1,10 @@
 //! Search and re-ranking of every query, as the service does them, with the time each stage takes.
 
-use super::EvalError;
+use super::error::EvalError;
 use super::features::Features;
-use indicatif::ProgressBar;
+use placeformer_core::progress::Task;
 use placeformer_core::types::{GLOBAL_DIM, PackedPatches, ReferenceFilter, ReferenceId};
-use placeformer_vision::rerank::{PairScore, RerankConfig, Reranked, Reranker};
+use placeformer_vision::rerank::{PairScore, Ranked, RerankConfig, Reranked, Reranker};
 use placeformer_vision::search::{IndexEntry, MapIndex};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -99,13 +99,16 @@ pub type LoadPatches<'a> =
 
 /// Re-ranks the candidates of every answer; the second value is the mean seconds per query (load,
 /// rerank).
+///
+/// # Errors
+/// Key patches cannot be loaded.
 pub fn rerank_all(
     patches: &LoadPatches<'_>,
     database: &Features,
     queries: &Features,
     mut answers: Vec<Answer>,
     config: &RerankConfig,
-    progress: &ProgressBar,
+    task: &Task<'_>,
 ) -> Result<(Vec<Answer>, QuerySeconds), EvalError> {
     let reranker = Reranker::new(config.clone());
     let mut seconds = QuerySeconds::default();
@@ -113,52 +116,49 @@ pub fn rerank_all(
         let start = Instant::now();
         let query = patches(queries, answer.query)?;
         let load = |neighbour: &Neighbour| patches(database, neighbour.index);
-        let candidates: Vec<_> = answer
-            .global
-            .par_iter()
-            .map(load)
-            .collect::<Result<_, _>>()?;
+        let candidates = answer.global.par_iter().map(load);
+        let candidates: Vec<Arc<PackedPatches>> = candidates.collect::<Result<_, _>>()?;
         seconds.load += start.elapsed().as_secs_f64();
+
         let start = Instant::now();
-        let outcome = reranker.rerank(
-            &query,
-            candidates.len(),
-            |i| Ok::<_, EvalError>(candidates[i].clone()),
-            None,
-        );
+        let ranked = rerank(&reranker, &query, &candidates)?;
         seconds.rerank += start.elapsed().as_secs_f64();
-        match outcome {
-            Reranked::Complete { ranked, mut failed } => {
-                if let Some((_, error)) = failed.pop() {
-                    return Err(error);
+
+        answer.reranked = ranked
+            .into_iter()
+            .map(|ranked| {
+                let Neighbour { index, distance } = answer.global[ranked.candidate];
+                Candidate {
+                    index,
+                    distance,
+                    score: ranked.score,
                 }
-                let candidate = |ranked: placeformer_vision::rerank::Ranked| {
-                    let Neighbour { index, distance } = answer.global[ranked.candidate];
-                    Candidate {
-                        index,
-                        distance,
-                        score: ranked.score,
-                    }
-                };
-                answer.reranked = ranked.into_iter().map(candidate).collect();
-            }
-            Reranked::DeadlinePassed => {
-                return Err(EvalError::Setting(
-                    "re-ranking stopped at a deadline though none was set".into(),
-                ));
-            }
-        }
-        progress.inc(1);
+            })
+            .collect();
+        task.add(1);
     }
     let count = answers.len().max(1) as f64;
-    Ok((
-        answers,
-        QuerySeconds {
-            load: seconds.load / count,
-            rerank: seconds.rerank / count,
-            ..seconds
+    seconds.load /= count;
+    seconds.rerank /= count;
+    Ok((answers, seconds))
+}
+
+/// Ranks candidates that are all in memory, with all the time that it takes.
+fn rerank(
+    reranker: &Reranker,
+    query: &PackedPatches,
+    candidates: &[Arc<PackedPatches>],
+) -> Result<Vec<Ranked>, EvalError> {
+    let load = |i: usize| Ok::<_, EvalError>(candidates[i].clone());
+    match reranker.rerank(query, candidates.len(), load, None) {
+        Reranked::Complete { ranked, mut failed } => match failed.pop() {
+            Some((_, error)) => Err(error),
+            None => Ok(ranked),
         },
-    ))
+        Reranked::DeadlinePassed => Err(EvalError::Setting(
+            "re-ranking stopped at a deadline though none was set".into(),
+        )),
+    }
 }
 
 /// Exact search over global vectors: the service's index at its length, else a plain scan.
@@ -181,9 +181,8 @@ impl<'f> Searcher<'f> {
                 captured_at: None,
             })
         };
-        Self::Index(Box::new(MapIndex::build(
-            (0..database.len()).filter_map(entry).collect(),
-        )))
+        let entries = (0..database.len()).filter_map(entry).collect();
+        Self::Index(Box::new(MapIndex::build(entries)))
     }
 
     fn search(&self, query: &[f32], k: usize) -> Vec<Neighbour> {

@@ -1,7 +1,9 @@
 //! A map and its queries as a folder, in the layout that place recognition data sets share.
 
+use super::light::Condition;
 use super::random::{Dice, seed_of};
-use super::{Capture, Condition, PLACES_PER_STREET, StreetWorld, Viewpoint};
+use super::world::{Capture, PLACES_PER_STREET, StreetWorld, Viewpoint};
+use placeformer_core::progress::{Progress, Task};
 use placeformer_core::types::{GeoPoint, Heading, ImageSize};
 use placeformer_vision::image::{ImageError, encode_jpeg};
 use rayon::prelude::*;
@@ -21,7 +23,7 @@ const FIRST_CAPTURE: i64 = 1_777_888_800;
 
 /// What to write.
 #[derive(Debug, Clone)]
-pub struct DatasetOptions {
+pub struct TownOptions {
     /// Mapped places.
     pub places: u64,
     /// Reference images of each place.
@@ -36,7 +38,7 @@ pub struct DatasetOptions {
 
 /// What was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct DatasetSummary {
+pub struct TownSummary {
     /// Images in `database/`.
     pub references: usize,
     /// Images in `queries/`.
@@ -47,7 +49,7 @@ pub struct DatasetSummary {
 
 /// Why a data set was not written.
 #[derive(Debug, thiserror::Error)]
-pub enum DatasetError {
+pub enum SynthError {
     /// A file or folder cannot be written.
     #[error("cannot write {}: {source}", path.display())]
     Write {
@@ -88,17 +90,17 @@ struct Shot {
 }
 
 /// Renders `database/`, `queries/`, `ground_truth.csv` (query, reference) and `positions.csv`
-/// (file, lat, lon, heading, captured_at) into `folder`; `progress` is called after each image.
+/// (file, lat, lon, heading, captured_at) into `folder`; `progress` is told of each image.
 ///
 /// # Errors
-/// See [`DatasetError`]. The tables are written last, so a folder that has them is complete.
-pub fn write_dataset(
+/// See [`SynthError`]. The tables are written last, so a folder that has them is complete.
+pub fn write_town(
     folder: &Path,
-    options: &DatasetOptions,
-    progress: impl Fn() + Sync,
-) -> Result<DatasetSummary, DatasetError> {
+    options: &TownOptions,
+    progress: &dyn Progress,
+) -> Result<TownSummary, SynthError> {
     if options.places == 0 || options.views == 0 || options.conditions.is_empty() {
-        return Err(DatasetError::Nothing(
+        return Err(SynthError::Nothing(
             "a data set needs at least one place, one view and one condition",
         ));
     }
@@ -108,32 +110,29 @@ pub fn write_dataset(
     for name in ["database", "queries"] {
         make_empty(&folder.join(name))?;
     }
+    let images = (references.len() + queries.len()) as u64;
+    let task = Task::begin(progress, "rendering images", images);
     references.par_iter().chain(&queries).try_for_each(|shot| {
         let image = world.render_capture(shot.place, shot.viewpoint, shot.capture, options.size);
         let path = folder.join(shot.folder).join(&shot.name);
         let bytes = encode_jpeg(&image, JPEG_QUALITY)?;
-        fs::write(&path, bytes).map_err(|source| DatasetError::Write { path, source })?;
-        progress();
-        Ok::<_, DatasetError>(())
+        fs::write(&path, bytes).map_err(|source| SynthError::Write { path, source })?;
+        task.add(1);
+        Ok::<_, SynthError>(())
     })?;
     let unmatched = write_ground_truth(&folder.join("ground_truth.csv"), &queries, &references)?;
     write_positions(
         &folder.join("positions.csv"),
         references.iter().chain(&queries),
     )?;
-    Ok(DatasetSummary {
+    Ok(TownSummary {
         references: references.len(),
         queries: queries.len(),
         unmatched,
     })
 }
 
-/// How many images `options` asks for, for a progress bar.
-pub fn image_count(options: &DatasetOptions) -> u64 {
-    options.places * options.views + options.places + unmatched_count(options)
-}
-
-fn unmatched_count(options: &DatasetOptions) -> u64 {
+fn unmatched_count(options: &TownOptions) -> u64 {
     options.places.div_ceil(10)
 }
 
@@ -152,7 +151,7 @@ fn reference_viewpoint(world: StreetWorld, place: u64, view: u64) -> Viewpoint {
     }
 }
 
-fn references(world: StreetWorld, options: &DatasetOptions) -> Vec<Shot> {
+fn references(world: StreetWorld, options: &TownOptions) -> Vec<Shot> {
     let views =
         (0..options.places).flat_map(|place| (0..options.views).map(move |view| (place, view)));
     views
@@ -166,7 +165,7 @@ fn references(world: StreetWorld, options: &DatasetOptions) -> Vec<Shot> {
 
 /// One query of every place, from elsewhere, in other light and more traffic; then some of places
 /// that nobody mapped.
-fn queries(world: StreetWorld, options: &DatasetOptions) -> Vec<Shot> {
+fn queries(world: StreetWorld, options: &TownOptions) -> Vec<Shot> {
     // Unmapped places lie on streets of their own, a street away from the last mapped one.
     let beyond = (options.places / PLACES_PER_STREET + 2) * PLACES_PER_STREET;
     let unmapped = (0..unmatched_count(options)).map(|i| beyond + i);
@@ -201,7 +200,8 @@ fn shot(
     viewpoint: Viewpoint,
     capture: Capture,
 ) -> Shot {
-    let (location, heading) = (world.position(place, viewpoint), world.heading(viewpoint));
+    let location = world.position(place, viewpoint);
+    let heading = world.heading(viewpoint);
     let hour = if capture.condition == Condition::Dusk {
         10
     } else {
@@ -233,7 +233,8 @@ fn shot(
     }
 }
 
-/// `@utm_east@utm_north@zone@band@lat@lon@panorama@tile@heading@pitch@roll@height@timestamp@note@.jpg`.
+/// The name of an image in the layout of the field: `@utm_east@utm_north@zone@band@lat@lon`, then
+/// `@panorama@tile@heading@pitch@roll@height@timestamp@note@.jpg`.
 fn file_name(
     location: GeoPoint,
     heading: Heading,
@@ -241,25 +242,27 @@ fn file_name(
     id: &str,
     condition: Condition,
 ) -> String {
-    let (lat, lon) = (location.lat(), location.lon());
+    let lat = location.lat();
+    let lon = location.lon();
     let (north, east, _) = utm::to_utm_wgs84_no_zone(lat, lon);
     let zone = utm::lat_lon_to_zone_number(lat, lon);
     let band = utm::lat_to_zone_letter(lat).unwrap_or('X');
     let stamp = format!("{:04}{:02}{:02}", at.year(), u8::from(at.month()), at.day());
     let heading = heading.degrees();
     format!(
-        "@{east:.2}@{north:.2}@{zone}@{band}@{lat:.6}@{lon:.6}@{id}@@{heading:.1}@@@@{stamp}@{condition}@.jpg"
+        "@{east:.2}@{north:.2}@{zone}@{band}@{lat:.6}@{lon:.6}\
+         @{id}@@{heading:.1}@@@@{stamp}@{condition}@.jpg"
     )
 }
 
-fn make_empty(folder: &Path) -> Result<(), DatasetError> {
-    let fail = |source| DatasetError::Write {
+fn make_empty(folder: &Path) -> Result<(), SynthError> {
+    let fail = |source| SynthError::Write {
         path: folder.to_owned(),
         source,
     };
     fs::create_dir_all(folder).map_err(fail)?;
     match fs::read_dir(folder).map_err(fail)?.next() {
-        Some(_) => Err(DatasetError::NotEmpty(folder.to_owned())),
+        Some(_) => Err(SynthError::NotEmpty(folder.to_owned())),
         None => Ok(()),
     }
 }
@@ -270,7 +273,7 @@ fn write_ground_truth(
     path: &Path,
     queries: &[Shot],
     references: &[Shot],
-) -> Result<usize, DatasetError> {
+) -> Result<usize, SynthError> {
     let mut rows = vec![["query".to_owned(), "reference".to_owned()]];
     let mut unmatched = 0;
     for query in queries {
@@ -297,7 +300,7 @@ fn shows_the_same(query: &Shot, reference: &Shot) -> bool {
 fn write_positions<'a>(
     path: &Path,
     shots: impl Iterator<Item = &'a Shot>,
-) -> Result<(), DatasetError> {
+) -> Result<(), SynthError> {
     let header = ["file", "lat", "lon", "heading", "captured_at"].map(str::to_owned);
     let rows = shots.map(|shot| {
         [
@@ -315,8 +318,8 @@ fn write_positions<'a>(
 fn write_table<const N: usize>(
     path: &Path,
     rows: impl IntoIterator<Item = [String; N]>,
-) -> Result<(), DatasetError> {
-    let fail = |source| DatasetError::Table {
+) -> Result<(), SynthError> {
+    let fail = |source| SynthError::Table {
         path: path.to_owned(),
         source,
     };
@@ -324,121 +327,11 @@ fn write_table<const N: usize>(
     rows.into_iter()
         .try_for_each(|row| writer.write_record(row))
         .map_err(fail)?;
-    writer.flush().map_err(|source| DatasetError::Write {
+    writer.flush().map_err(|source| SynthError::Write {
         path: path.to_owned(),
         source,
     })
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use placeformer_vision::image::{ImageConfig, decode};
-    use std::collections::{HashMap, HashSet};
-
-    fn options() -> DatasetOptions {
-        let size = ImageSize {
-            width: 48,
-            height: 36,
-        };
-        DatasetOptions {
-            places: 2,
-            views: 1,
-            seed: 4,
-            size,
-            conditions: vec![Condition::Dusk, Condition::Overcast],
-        }
-    }
-
-    fn rows(path: &Path) -> Vec<csv::StringRecord> {
-        csv::Reader::from_path(path)
-            .unwrap()
-            .records()
-            .map(Result::unwrap)
-            .collect()
-    }
-
-    #[test]
-    fn a_data_set_is_whole_consistent_and_the_same_twice() {
-        let folders = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
-        let summaries = folders
-            .each_ref()
-            .map(|folder| write_dataset(folder.path(), &options(), || {}).unwrap());
-        assert_eq!(
-            summaries[0],
-            DatasetSummary {
-                references: 2,
-                queries: 3,
-                unmatched: 1
-            }
-        );
-        let folder = folders[0].path();
-        let positions = rows(&folder.join("positions.csv"));
-        assert_eq!(positions.len(), 5);
-        assert_eq!(image_count(&options()), 5);
-        let mut places = HashMap::new();
-        for row in &positions {
-            let bytes = fs::read(folder.join(&row[0])).unwrap();
-            assert_eq!(bytes, fs::read(folders[1].path().join(&row[0])).unwrap());
-            assert_eq!(
-                decode(&bytes, &ImageConfig::default()).unwrap().size,
-                options().size
-            );
-            let place = GeoPoint::new(row[1].parse().unwrap(), row[2].parse().unwrap()).unwrap();
-            assert!(OffsetDateTime::parse(&row[4], &Rfc3339).is_ok());
-            places.insert(row[0].split_once('/').unwrap().1.to_owned(), place);
-        }
-        let truth = rows(&folder.join("ground_truth.csv"));
-        let queries: HashSet<_> = truth.iter().map(|row| row[0].to_owned()).collect();
-        assert_eq!(queries.len(), 3);
-        for row in truth.iter().filter(|row| !row[1].is_empty()) {
-            assert!(places[&row[0]].distance_m(places[&row[1]]) <= MATCH_RADIUS_M);
-        }
-        for row in truth.iter().filter(|row| row[1].is_empty()) {
-            let far = positions
-                .iter()
-                .filter(|position| position[0].starts_with("database/"));
-            let query = places[&row[0]];
-            let name =
-                |position: &csv::StringRecord| position[0].split_once('/').unwrap().1.to_owned();
-            assert!(
-                far.map(|position| places[&name(position)].distance_m(query))
-                    .all(|metres| metres > 100.0)
-            );
-        }
-    }
-
-    #[test]
-    fn names_carry_the_position_in_utm() {
-        let world = StreetWorld::new(4);
-        let shot = references(world, &options()).remove(0);
-        let fields: Vec<&str> = shot.name.split('@').collect();
-        let number = |i: usize| fields[i].parse::<f64>().unwrap();
-        assert_eq!(
-            (fields.len(), fields[3], fields[4], fields[15]),
-            (16, "32", "U", ".jpg")
-        );
-        let (lat, lon) = utm::wsg84_utm_to_lat_lon(number(1), number(2), 32, 'U').unwrap();
-        assert!(GeoPoint::new(lat, lon).unwrap().distance_m(shot.location) < 0.1);
-        assert!((number(9) - shot.heading.degrees()).abs() <= 0.05);
-    }
-
-    #[test]
-    fn nothing_is_written_into_a_folder_with_images_or_without_a_place() {
-        let folder = tempfile::tempdir().unwrap();
-        fs::create_dir_all(folder.path().join("database")).unwrap();
-        fs::write(folder.path().join("database/mine.jpg"), b"keep").unwrap();
-        assert!(matches!(
-            write_dataset(folder.path(), &options(), || {}),
-            Err(DatasetError::NotEmpty(_))
-        ));
-        let empty = DatasetOptions {
-            places: 0,
-            ..options()
-        };
-        assert!(matches!(
-            write_dataset(folder.path(), &empty, || {}),
-            Err(DatasetError::Nothing(_))
-        ));
-    }
-}
+mod tests;

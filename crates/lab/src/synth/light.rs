@@ -195,7 +195,8 @@ impl Light {
             Condition::Overcast => ([0.66, 0.69, 0.73], [0.8, 0.82, 0.84]),
             Condition::Dusk => ([0.05, 0.08, 0.2], [0.5, 0.3, 0.26]),
         };
-        let (zenith, horizon) = (Vec3::from(zenith), Vec3::from(horizon));
+        let zenith = Vec3::from(zenith);
+        let horizon = Vec3::from(horizon);
         let base = horizon + (zenith - horizon) * up.powf(0.55);
         let plane = 1.0 / (up + 0.12);
         let drift = fractal(
@@ -243,7 +244,8 @@ pub(super) fn develop(
     moment: u64,
 ) -> RgbImage {
     let mut dice = Dice::new(&[moment, 0x1e5]);
-    let (width, height) = (camera.width / 2, camera.height / 2);
+    let width = camera.width / 2;
+    let height = camera.height / 2;
     let exposure = dice.real(0.85..1.15)
         * match condition {
             Condition::Day => 0.95,
@@ -260,10 +262,8 @@ pub(super) fn develop(
     let mut pixels = Vec::with_capacity(width * height * 3);
     for y in 0..height {
         for x in 0..width {
-            let (dx, dy) = (
-                x as f32 / width as f32 - 0.5,
-                y as f32 / height as f32 - 0.5,
-            );
+            let dx = x as f32 / width as f32 - 0.5;
+            let dy = y as f32 / height as f32 - 0.5;
             let vignette = 1.0 - 0.42 * (dx * dx + dy * dy);
             let light = Vec3::from(softened(&half, width, height, x, y));
             let exposed = light.component_mul(&balance) * (exposure * vignette);

@@ -71,10 +71,8 @@ impl Painting {
             GradientStop::new(0.0, colour(upper)),
             GradientStop::new(1.0, colour(lower)),
         ];
-        let (from, to) = (
-            Point::from_xy(left, top),
-            Point::from_xy(left + width * 0.4, top + height),
-        );
+        let from = Point::from_xy(left, top);
+        let to = Point::from_xy(left + width * 0.4, top + height);
         if let Some(shader) =
             LinearGradient::new(from, to, stops, SpreadMode::Pad, Transform::identity())
         {
@@ -146,7 +144,8 @@ impl Painting {
 
     /// Multiplies every texel by `factor(x, y)`, position in metres.
     pub(super) fn modulate(&mut self, factor: impl Fn(f32, f32) -> f32) {
-        let (width, scale) = (self.colour.width() as usize, self.scale);
+        let width = self.colour.width() as usize;
+        let scale = self.scale;
         for (at, texel) in self.colour.pixels_mut().iter_mut().enumerate() {
             if texel.alpha() == 0 {
                 continue;

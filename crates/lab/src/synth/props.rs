@@ -1,6 +1,6 @@
 //! What stands in the street: trees, lamps, signs, and the vans, cars and people that come and go.
 
-use super::facade::paint_lettering;
+use super::lettering::paint_lettering;
 use super::paint::{Painting, shaded};
 use super::random::{Dice, fractal, lattice};
 
@@ -9,7 +9,8 @@ pub(super) fn paint_tree(size: [f32; 2], scale: f32, seed: u64) -> Painting {
     let [width, height] = size;
     let mut tree = Painting::new(width, height, scale);
     let mut dice = Dice::new(&[seed, 3]);
-    let (middle, bark) = (width / 2.0, [84, 68, 56]);
+    let middle = width / 2.0;
+    let bark = [84, 68, 56];
     let lean = dice.real(-0.25..0.25);
     tree.polygon(
         &[
@@ -32,10 +33,8 @@ pub(super) fn paint_tree(size: [f32; 2], scale: f32, seed: u64) -> Painting {
     for layer in 0..5 {
         let light = 0.62 + 0.14 * layer as f32;
         for _ in 0..90 {
-            let (angle, reach) = (
-                dice.real(0.0..std::f32::consts::TAU),
-                dice.real(0.0..1.0f32).sqrt(),
-            );
+            let angle = dice.real(0.0..std::f32::consts::TAU);
+            let reach = dice.real(0.0..1.0f32).sqrt();
             let spread = 0.46 - 0.035 * layer as f32;
             let centre = [
                 middle + angle.cos() * reach * spread * width,
@@ -126,182 +125,6 @@ pub(super) fn paint_hanging_sign(accent: [u8; 3], scale: f32, seed: u64) -> Pain
     sign
 }
 
-/// The outline of a vehicle from its tail over the roof to its nose, in shares of length and height
-/// (down from the top), and whether the panel up to the next point is glass.
-pub(super) type Outline = [([f32; 2], bool)];
-
-/// A saloon car.
-pub(super) const CAR: &Outline = &[
-    ([0.0, 0.88], false),
-    ([0.01, 0.5], false),
-    ([0.14, 0.42], true),
-    ([0.27, 0.03], false),
-    ([0.6, 0.03], true),
-    ([0.75, 0.42], false),
-    ([0.97, 0.52], false),
-    ([1.0, 0.88], false),
-];
-
-/// A delivery van.
-pub(super) const VAN: &Outline = &[
-    ([0.0, 0.9], false),
-    ([0.0, 0.08], false),
-    ([0.03, 0.03], false),
-    ([0.72, 0.03], true),
-    ([0.86, 0.42], false),
-    ([0.98, 0.52], false),
-    ([1.0, 0.9], false),
-];
-
-/// The flank of a vehicle, nose to the right; metres.
-pub(super) fn paint_flank(
-    outline: &Outline,
-    [length, height]: [f32; 2],
-    colour: [u8; 3],
-    scale: f32,
-    seed: u64,
-) -> Painting {
-    let mut flank = Painting::new(length, height, scale);
-    let mut dice = Dice::new(&[seed, 7]);
-    let glass = [48, 58, 68];
-    let at = |x: f32, y: f32| [length * x, height * y];
-    let points: Vec<[f32; 2]> = outline.iter().map(|([x, y], _)| at(*x, *y)).collect();
-    flank.polygon(&points, colour);
-    if outline.len() == VAN.len() {
-        flank.polygon(
-            &[
-                at(0.66, 0.12),
-                at(0.73, 0.12),
-                at(0.83, 0.42),
-                at(0.66, 0.42),
-            ],
-            glass,
-        );
-        flank.rect(
-            length * 0.64,
-            height * 0.1,
-            0.03,
-            height * 0.75,
-            shaded(colour, 0.7),
-        );
-        if dice.chance(0.7) {
-            let ink = dice.pick(&[[240, 240, 240], [30, 40, 90], [180, 40, 40], [40, 40, 44]]);
-            let letters = dice.whole(4..9);
-            paint_lettering(
-                &mut flank,
-                at(0.1, 0.25),
-                at(0.45, 0.2),
-                ink,
-                letters,
-                &mut dice,
-            );
-        }
-    } else {
-        flank.polygon(
-            &[at(0.2, 0.42), at(0.3, 0.11), at(0.44, 0.11), at(0.44, 0.42)],
-            glass,
-        );
-        flank.polygon(
-            &[
-                at(0.47, 0.11),
-                at(0.58, 0.11),
-                at(0.7, 0.42),
-                at(0.47, 0.42),
-            ],
-            glass,
-        );
-        flank.rect(
-            length * 0.455,
-            height * 0.42,
-            0.02,
-            height * 0.4,
-            shaded(colour, 0.7),
-        );
-    }
-    flank.tint(
-        length * 0.01,
-        height * 0.57,
-        length * 0.97,
-        0.04,
-        [0, 0, 0],
-        0.3,
-    );
-    flank.rect(
-        length * 0.02,
-        height * 0.8,
-        length * 0.96,
-        height * 0.09,
-        shaded(colour, 0.55),
-    );
-    for axle in [length * 0.19, length * 0.81] {
-        flank.ellipse([axle, height - 0.34], [0.38, 0.38], [18, 18, 20], 1.0);
-        flank.ellipse([axle, height - 0.31], [0.31, 0.31], [28, 28, 30], 1.0);
-        flank.ellipse([axle, height - 0.31], [0.17, 0.17], [140, 142, 146], 1.0);
-    }
-    flank.rect(
-        length * 0.97,
-        height * 0.58,
-        length * 0.02,
-        0.12,
-        [240, 236, 210],
-    );
-    flank.rect(length * 0.012, height * 0.56, 0.1, 0.14, [170, 24, 28]);
-    flank
-}
-
-/// The tail or the nose of a vehicle: lamps, number plate, bumper.
-pub(super) fn paint_end(
-    [width, height]: [f32; 2],
-    colour: [u8; 3],
-    lamps: [u8; 3],
-    scale: f32,
-    seed: u64,
-) -> Painting {
-    let mut end = Painting::new(width, height, scale);
-    let mut dice = Dice::new(&[seed, 8]);
-    end.rect(0.0, 0.0, width, height, colour);
-    if height > 1.2 {
-        // A van's back doors.
-        end.rect(
-            width / 2.0 - 0.01,
-            0.1,
-            0.03,
-            height - 0.3,
-            shaded(colour, 0.6),
-        );
-        for left in [0.2, width / 2.0 + 0.12] {
-            end.rect(
-                left,
-                height * 0.12,
-                width / 2.0 - 0.32,
-                height * 0.25,
-                [52, 62, 72],
-            );
-        }
-    }
-    let belt = (height - 0.5).max(0.05);
-    for left in [0.04, width - 0.28] {
-        end.rect(left, belt, 0.24, 0.15, lamps);
-    }
-    end.rect(
-        width / 2.0 - 0.27,
-        height - 0.34,
-        0.54,
-        0.13,
-        [236, 236, 230],
-    );
-    paint_lettering(
-        &mut end,
-        [width / 2.0 - 0.23, height - 0.32],
-        [0.46, 0.09],
-        [20, 20, 24],
-        6,
-        &mut dice,
-    );
-    end.rect(0.0, height - 0.17, width, 0.17, shaded(colour, 0.45));
-    end
-}
-
 /// A person, 1.8 m high and 0.8 m wide, walking.
 pub(super) fn paint_person(scale: f32, seed: u64) -> Painting {
     let mut person = Painting::new(0.8, 1.8, scale);
@@ -381,10 +204,8 @@ pub(super) fn paint_ground(plan: &GroundPlan, scale: f32, [street, stretch]: [u6
         ground.rect(0.0, top, length, 0.14, [178, 174, 166]);
     }
     for _ in 0..dice.whole(0..3) {
-        let (x, y) = (
-            dice.real(0.0..length - 4.0),
-            dice.real(pavement + 0.5..width - pavement - 1.5),
-        );
+        let x = dice.real(0.0..length - 4.0);
+        let y = dice.real(pavement + 0.5..width - pavement - 1.5);
         ground.tint(
             x,
             y,

@@ -66,9 +66,11 @@ pub(super) fn lattice(seed: u64, x: i32, y: i32) -> f32 {
 
 /// Smooth noise in 0..1 with features about one unit wide.
 pub(super) fn noise(seed: u64, x: f32, y: f32) -> f32 {
-    let (left, top) = (x.floor(), y.floor());
+    let left = x.floor();
+    let top = y.floor();
     let ease = |t: f32| t * t * (3.0 - 2.0 * t);
-    let (fx, fy) = (ease(x - left), ease(y - top));
+    let fx = ease(x - left);
+    let fy = ease(y - top);
     let at = |dx: i32, dy: i32| lattice(seed, left as i32 + dx, top as i32 + dy);
     let upper = at(0, 0) + (at(1, 0) - at(0, 0)) * fx;
     let lower = at(0, 1) + (at(1, 1) - at(0, 1)) * fx;
@@ -77,7 +79,10 @@ pub(super) fn noise(seed: u64, x: f32, y: f32) -> f32 {
 
 /// `octaves` layers of [`noise`], each half as wide and half as strong as the one before; in 0..1.
 pub(super) fn fractal(seed: u64, x: f32, y: f32, octaves: u32) -> f32 {
-    let (mut sum, mut weight, mut total, mut zoom) = (0.0, 1.0, 0.0, 1.0);
+    let mut sum = 0.0;
+    let mut weight = 1.0;
+    let mut total = 0.0;
+    let mut zoom = 1.0;
     for octave in 0..octaves {
         sum += weight * noise(seed.wrapping_add(u64::from(octave)), x * zoom, y * zoom);
         total += weight;
@@ -119,7 +124,8 @@ mod tests {
     #[test]
     fn noise_is_smooth_and_bounded() {
         for i in 0..2000 {
-            let (x, y) = (i as f32 * 0.173 - 100.0, i as f32 * 0.091 - 50.0);
+            let x = i as f32 * 0.173 - 100.0;
+            let y = i as f32 * 0.091 - 50.0;
             let here = fractal(7, x, y, 4);
             assert!((0.0..=1.0).contains(&here));
             assert!((here - fractal(7, x + 1e-3, y, 4)).abs() < 0.02);

@@ -54,7 +54,8 @@ impl Texture {
     /// The colour at (u, v) in 0..1, averaged over `footprint` texels.
     pub(super) fn sample(&self, u: f32, v: f32, footprint: f32) -> Texel {
         let level = footprint.log2().clamp(0.0, (self.levels.len() - 1) as f32);
-        let (fine, along) = (level as usize, level.fract());
+        let fine = level as usize;
+        let along = level.fract();
         let mut mixed = self.levels[fine].bilinear(u, v);
         if along > 0.0 {
             let coarse = self.levels[(fine + 1).min(self.levels.len() - 1)].bilinear(u, v);
@@ -74,19 +75,17 @@ impl Level {
     fn bilinear(&self, u: f32, v: f32) -> [f32; 5] {
         let x = (u * self.width as f32 - 0.5).clamp(0.0, (self.width - 1) as f32);
         let y = (v * self.height as f32 - 0.5).clamp(0.0, (self.height - 1) as f32);
-        let (left, top) = (x as usize, y as usize);
-        let (right, bottom) = (
-            (left + 1).min(self.width - 1),
-            (top + 1).min(self.height - 1),
-        );
-        let (fx, fy) = (x - left as f32, y - top as f32);
+        let left = x as usize;
+        let top = y as usize;
+        let right = (left + 1).min(self.width - 1);
+        let bottom = (top + 1).min(self.height - 1);
+        let fx = x - left as f32;
+        let fy = y - top as f32;
         let at = |x: usize, y: usize| &self.texels[y * self.width + x];
-        let (a, b, c, d) = (
-            at(left, top),
-            at(right, top),
-            at(left, bottom),
-            at(right, bottom),
-        );
+        let a = at(left, top);
+        let b = at(right, top);
+        let c = at(left, bottom);
+        let d = at(right, bottom);
         std::array::from_fn(|i| {
             let upper = a[i] + (b[i] - a[i]) * fx;
             let lower = c[i] + (d[i] - c[i]) * fx;
@@ -95,12 +94,15 @@ impl Level {
     }
 
     fn halved(&self) -> Self {
-        let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
+        let width = self.width.div_ceil(2);
+        let height = self.height.div_ceil(2);
         let mut texels = Vec::with_capacity(width * height);
         for y in 0..height {
             for x in 0..width {
-                let (x0, y0) = (x * 2, y * 2);
-                let (x1, y1) = ((x0 + 1).min(self.width - 1), (y0 + 1).min(self.height - 1));
+                let x0 = x * 2;
+                let y0 = y * 2;
+                let x1 = (x0 + 1).min(self.width - 1);
+                let y1 = (y0 + 1).min(self.height - 1);
                 let four = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)]
                     .map(|(x, y)| self.texels[y * self.width + x]);
                 texels.push(std::array::from_fn(|i| {

@@ -4,7 +4,7 @@
 //! Works on normalised tensors, so that decoding and resizing are those of inference. Never
 //! mirrors: a mirrored street is another place.
 
-use super::TrainError;
+use super::error::TrainError;
 use placeformer_core::types::ImageTensor;
 use placeformer_vision::image::{DEVIATION, MEAN};
 use rand::{RngExt, SeedableRng};
@@ -82,11 +82,9 @@ pub fn augment(image: &ImageTensor, strength: &Augmentation, seed: u64) -> Image
             1.0
         }
     };
-    let (brightness, contrast, saturation) = (
-        around_one(strength.brightness),
-        around_one(strength.contrast),
-        around_one(strength.saturation),
-    );
+    let brightness = around_one(strength.brightness);
+    let contrast = around_one(strength.contrast);
+    let saturation = around_one(strength.saturation);
     let mut varied = match strength.viewpoint {
         share if share > 0.0 => {
             let mut shift = || rng.random_range(-share..=share);
@@ -129,8 +127,10 @@ fn recolour(image: &mut ImageTensor, brightness: f32, contrast: f32, saturation:
 /// Looks at `image` through a window whose corners are shifted by shares of the sides (top left,
 /// top right, bottom right, bottom left); beyond the border the edge is repeated.
 fn warp(image: &ImageTensor, shifts: &[[f32; 2]; 4]) -> ImageTensor {
-    let (width, height) = (image.size.width as usize, image.size.height as usize);
-    let (w, h) = (width as f32 - 1.0, height as f32 - 1.0);
+    let width = image.size.width as usize;
+    let height = image.size.height as usize;
+    let w = width as f32 - 1.0;
+    let h = height as f32 - 1.0;
     let square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
     let corners: [[f32; 2]; 4] = std::array::from_fn(|i| {
         [
@@ -142,13 +142,17 @@ fn warp(image: &ImageTensor, shifts: &[[f32; 2]; 4]) -> ImageTensor {
     let mut data = vec![0.0; image.data.len()];
     for y in 0..height {
         for x in 0..width {
-            let (u, v) = (x as f32 / w.max(1.0), y as f32 / h.max(1.0));
+            let u = x as f32 / w.max(1.0);
+            let v = y as f32 / h.max(1.0);
             let scale = map[6] * u + map[7] * v + 1.0;
             let source_x = ((map[0] * u + map[1] * v + map[2]) / scale).clamp(0.0, w);
             let source_y = ((map[3] * u + map[4] * v + map[5]) / scale).clamp(0.0, h);
-            let (left, top) = (source_x as usize, source_y as usize);
-            let (right, bottom) = ((left + 1).min(width - 1), (top + 1).min(height - 1));
-            let (fx, fy) = (source_x - left as f32, source_y - top as f32);
+            let left = source_x as usize;
+            let top = source_y as usize;
+            let right = (left + 1).min(width - 1);
+            let bottom = (top + 1).min(height - 1);
+            let fx = source_x - left as f32;
+            let fy = source_y - top as f32;
             for plane in 0..3 {
                 let at =
                     |row: usize, column: usize| image.data[(plane * height + row) * width + column];
@@ -168,8 +172,12 @@ fn warp(image: &ImageTensor, shifts: &[[f32; 2]; 4]) -> ImageTensor {
 /// (Heckbert, 1989).
 fn square_to_quad(quad: &[[f32; 2]; 4]) -> [f32; 8] {
     let [[x0, y0], [x1, y1], [x2, y2], [x3, y3]] = *quad;
-    let (dx1, dx2, dx3) = (x1 - x2, x3 - x2, x0 - x1 + x2 - x3);
-    let (dy1, dy2, dy3) = (y1 - y2, y3 - y2, y0 - y1 + y2 - y3);
+    let dx1 = x1 - x2;
+    let dx2 = x3 - x2;
+    let dx3 = x0 - x1 + x2 - x3;
+    let dy1 = y1 - y2;
+    let dy2 = y3 - y2;
+    let dy3 = y0 - y1 + y2 - y3;
     let determinant = dx1 * dy2 - dx2 * dy1;
     let g = (dx3 * dy2 - dx2 * dy3) / determinant;
     let h = (dx1 * dy3 - dx3 * dy1) / determinant;
@@ -192,7 +200,8 @@ mod tests {
 
     /// A tensor whose planes hold the column, the row and a constant, in colours from 0 to 1.
     fn ramp() -> ImageTensor {
-        let (width, height) = (16usize, 12usize);
+        let width = 16usize;
+        let height = 12usize;
         let mut data = Vec::new();
         for plane in 0..3 {
             for y in 0..height {

@@ -1,15 +1,16 @@
 //! Training the transformer itself, wholly or its last blocks, together with the head.
 //!
-//! The same computation as [`placeformer_vision::extract::CandleEncoder`], built of differentiable operations
-//! only and over whole batches; a test holds the two together. Layers that are not trained are
-//! plain tensors, so that no graph is recorded through them.
+//! The same computation as [`CandleEncoder`](placeformer_vision::extract::CandleEncoder), built of
+//! differentiable operations only and over whole batches; a test compares the two. Layers that are
+//! not trained are plain tensors, so that no graph is recorded through them.
 
-use super::augment::augment;
+use super::augment::{Augmentation, augment};
 use super::config::TrainConfig;
+use super::error::TrainError;
 use super::loss::normalise_rows;
-use super::trainer::{Sample, Session, TripletModel, run};
+use super::model::{Sample, TripletModel};
+use super::trainer::{Outcome, Session, run};
 use super::triplets::TripletSet;
-use super::{Augmentation, Outcome, TrainError};
 use candle_core::{D, Device, Tensor, Var};
 use placeformer_core::types::{GLOBAL_DIM, ImageTensor};
 use placeformer_vision::extract::{
@@ -48,8 +49,24 @@ pub struct BackboneModel {
 const HEAD_WEIGHT: &str = "head.weight";
 const HEAD_BIAS: &str = "head.bias";
 
+impl TrainableBlocks {
+    /// Refuses more blocks than are computed, and none.
+    fn check(self, computed: usize) -> Result<()> {
+        match self {
+            Self::Last(count) if !(1..=computed).contains(&count) => Err(TrainError::Setting(
+                format!("{count} of {computed} computed blocks cannot be trained"),
+            )),
+            Self::Last(_) | Self::All => Ok(()),
+        }
+    }
+}
+
 impl BackboneModel {
     /// Starts from pre-trained weights and a head of `weight` `[256, dim]` and `bias` `[256]`.
+    ///
+    /// # Errors
+    /// More blocks are to be trained than are computed, or a tensor has another shape than the
+    /// model.
     pub fn new(
         base: VitWeights,
         spec: EncoderSpec,
@@ -59,14 +76,9 @@ impl BackboneModel {
         augmentation: Augmentation,
     ) -> Result<Self> {
         let blocks = spec.exit_block + 1;
-        if let TrainableBlocks::Last(count) = trainable
-            && !(1..=blocks).contains(&count)
-        {
-            return Err(TrainError::Setting(format!(
-                "{count} of {blocks} computed blocks cannot be trained"
-            )));
-        }
-        let (mut tensors, mut variables) = (HashMap::new(), BTreeMap::new());
+        trainable.check(blocks)?;
+        let mut tensors = HashMap::new();
+        let mut variables = BTreeMap::new();
         for (name, shape, values) in base.tensors() {
             if block_of(&name).is_some_and(|block| block >= blocks) {
                 continue;
@@ -80,11 +92,12 @@ impl BackboneModel {
                 tensors.insert(name, tensor);
             }
         }
-        let dim = base.geometry.dim;
-        for (name, values, shape) in [
-            (HEAD_WEIGHT, head.0, vec![GLOBAL_DIM, dim]),
-            (HEAD_BIAS, head.1, vec![GLOBAL_DIM]),
-        ] {
+        let (weight, bias) = head;
+        let of_head = [
+            (HEAD_WEIGHT, weight, vec![GLOBAL_DIM, base.geometry.dim]),
+            (HEAD_BIAS, bias, vec![GLOBAL_DIM]),
+        ];
+        for (name, values, shape) in of_head {
             let variable = Var::from_tensor(&Tensor::from_slice(values, shape, &Device::Cpu)?)?;
             tensors.insert(name.into(), variable.as_tensor().clone());
             variables.insert(name.into(), variable);
@@ -102,6 +115,11 @@ impl BackboneModel {
     }
 
     /// Trains in place; afterwards the weights are the best seen.
+    ///
+    /// # Errors
+    /// A setting is out of range, the checkpoint is one of another run, an image cannot be read, or
+    /// the
+    /// loss is no longer finite.
     pub fn train(
         &self,
         training: &TripletSet,
@@ -116,6 +134,9 @@ impl BackboneModel {
     ///
     /// The backbone's identity follows from its weights, so `backbone` is asked for only once these
     /// are written.
+    ///
+    /// # Errors
+    /// A file cannot be written, or `backbone` fails.
     pub fn save(
         &self,
         weights: &Path,
@@ -156,7 +177,8 @@ impl BackboneModel {
     /// Patch tokens of the exit block, `[batch, n, dim]`.
     fn tokens(&self, images: &[ImageTensor]) -> Result<Tensor> {
         let geometry = &self.base.geometry;
-        let (dim, patch) = (geometry.dim, geometry.patch);
+        let dim = geometry.dim;
+        let patch = geometry.patch;
         let patches: Vec<Tensor> = images
             .iter()
             .map(|image| unfold(image, patch))
@@ -188,7 +210,8 @@ impl BackboneModel {
 
     fn block(&self, x: &Tensor, block: usize) -> Result<Tensor> {
         let (batch, length, dim) = x.dims3()?;
-        let (heads, head_dim) = (self.base.geometry.heads, self.base.geometry.head_dim());
+        let heads = self.base.geometry.heads;
+        let head_dim = self.base.geometry.head_dim();
         let name = |part: &str| format!("blocks.{block}.{part}");
         let fused = self.dense(&self.norm(x, &name("norm1"))?, &name("attn.qkv"))?;
         let part = |index: usize| -> candle_core::Result<Tensor> {
@@ -232,10 +255,8 @@ impl BackboneModel {
     }
 
     fn norm(&self, x: &Tensor, layer: &str) -> Result<Tensor> {
-        let (weight, bias) = (
-            self.tensor(&format!("{layer}.weight"))?,
-            self.tensor(&format!("{layer}.bias"))?,
-        );
+        let weight = self.tensor(&format!("{layer}.weight"))?;
+        let bias = self.tensor(&format!("{layer}.bias"))?;
         // The fused LayerNorm of candle has no gradient.
         Ok(candle_nn::ops::layer_norm_slow(
             x,
@@ -297,8 +318,10 @@ fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
 
 /// Patches in row-major order, each as channel, row, column: `[n, 3 p p]`.
 fn unfold(image: &ImageTensor, patch: usize) -> Result<Tensor> {
-    let (width, height) = (image.size.width as usize, image.size.height as usize);
-    let (columns, rows) = (width / patch, height / patch);
+    let width = image.size.width as usize;
+    let height = image.size.height as usize;
+    let columns = width / patch;
+    let rows = height / patch;
     let planes = Tensor::from_slice(&image.data, (3, rows, patch, columns, patch), &Device::Cpu)?;
     Ok(planes
         .permute((1, 3, 0, 2, 4))?

@@ -1,14 +1,15 @@
 //! What a run needs to continue bit for bit: weights, moments, the best weights so far, counters,
 //! settings.
 //!
-//! One safetensors file, written beside and renamed over the last one, so that a run killed while
-//! saving keeps the previous checkpoint.
+//! One safetensors file, written under another name and renamed over the last one, so that a run
+//! killed while saving keeps the previous checkpoint.
 
-use super::TrainError;
 use super::adam::Adam;
 use super::config::{TrainConfig, ValidationRecall};
-use candle_core::{Device, Tensor};
+use super::error::TrainError;
+use candle_core::{Device, Shape, Tensor};
 use placeformer_core::files::write_atomically;
+use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::Path;
@@ -36,6 +37,51 @@ struct State {
     last_loss: f32,
     config: TrainConfig,
     identity: String,
+}
+
+impl State {
+    /// The state in the header of a checkpoint's bytes, or what is wrong with them.
+    fn read(bytes: &[u8]) -> Result<Self, String> {
+        let (_, header) =
+            SafeTensors::read_metadata(bytes).map_err(|error| format!("not readable: {error}"))?;
+        let metadata = header.metadata().as_ref();
+        let state = metadata
+            .and_then(|metadata| metadata.get(STATE))
+            .ok_or("it is not a training checkpoint")?;
+        serde_json::from_str(state).map_err(|error| format!("its header: {error}"))
+    }
+
+    /// Says why a run with these settings cannot go on from here.
+    fn check(&self, config: &TrainConfig, identity: &str) -> Result<(), String> {
+        if self.config != *config {
+            return Err(
+                "it belongs to a run with other settings; use them again or another folder".into(),
+            );
+        }
+        if self.identity != identity {
+            return Err("it belongs to a run on other data or from other weights; \
+                 use these again or another folder"
+                .into());
+        }
+        Ok(())
+    }
+}
+
+/// Takes a tensor of this shape out of `tensors`, or says why not.
+fn take_tensor(
+    tensors: &mut HashMap<String, Tensor>,
+    key: &str,
+    shape: &Shape,
+) -> Result<Tensor, String> {
+    let tensor = tensors
+        .remove(key)
+        .ok_or_else(|| format!("{key} is missing"))?;
+    if tensor.shape() == shape {
+        Ok(tensor)
+    } else {
+        let found = tensor.shape();
+        Err(format!("{key} has shape {found:?}, the model {shape:?}"))
+    }
 }
 
 impl Checkpoint {
@@ -99,38 +145,11 @@ impl Checkpoint {
             path: path.clone(),
             reason,
         };
-        let (_, header) = safetensors::SafeTensors::read_metadata(&bytes)
-            .map_err(|error| wrong(format!("not readable: {error}")))?;
-        let state = header
-            .metadata()
-            .as_ref()
-            .and_then(|metadata| metadata.get(STATE));
-        let state = state.ok_or_else(|| wrong("it is not a training checkpoint".into()))?;
-        let state: State =
-            serde_json::from_str(state).map_err(|error| wrong(format!("its header: {error}")))?;
-        if state.config != *config {
-            return Err(wrong(
-                "it belongs to a run with other settings; use them again or another folder".into(),
-            ));
-        }
-        if state.identity != identity {
-            let reason = "it belongs to a run on other data or from other weights; use these again or another folder";
-            return Err(wrong(reason.into()));
-        }
+        let state = State::read(&bytes).map_err(wrong)?;
+        state.check(config, identity).map_err(wrong)?;
         let mut tensors = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)?;
-        let mut take = |prefix: &str, name: &str, shape: &candle_core::Shape| {
-            let key = format!("{prefix}.{name}");
-            let tensor = tensors
-                .remove(&key)
-                .ok_or_else(|| wrong(format!("{key} is missing")))?;
-            if tensor.shape() == shape {
-                Ok(tensor)
-            } else {
-                Err(wrong(format!(
-                    "{key} has shape {:?}, the model {shape:?}",
-                    tensor.shape()
-                )))
-            }
+        let mut take = |prefix: &str, name: &str, shape: &Shape| {
+            take_tensor(&mut tensors, &format!("{prefix}.{name}"), shape).map_err(wrong)
         };
         let mut best_weights = HashMap::new();
         for slot in &mut adam.slots {
@@ -141,20 +160,12 @@ impl Checkpoint {
             best_weights.insert(slot.name.clone(), take("best", &slot.name, &shape)?);
         }
         adam.steps = state.steps;
-        let State {
-            steps,
-            cycles_without_gain,
-            initial,
-            best,
-            last_loss,
-            ..
-        } = state;
         Ok(Some(Self {
-            steps,
-            cycles_without_gain,
-            initial,
-            best,
-            last_loss,
+            steps: state.steps,
+            cycles_without_gain: state.cycles_without_gain,
+            initial: state.initial,
+            best: state.best,
+            last_loss: state.last_loss,
             best_weights,
         }))
     }
@@ -169,10 +180,8 @@ impl Checkpoint {
     ) -> Result<(), TrainError> {
         let mut tensors: HashMap<String, Tensor> = HashMap::new();
         for slot in &adam.slots {
-            tensors.insert(
-                format!("weights.{}", slot.name),
-                slot.variable.as_tensor().clone(),
-            );
+            let weights = slot.variable.as_tensor().clone();
+            tensors.insert(format!("weights.{}", slot.name), weights);
             tensors.insert(format!("first.{}", slot.name), slot.first.clone());
             tensors.insert(format!("second.{}", slot.name), slot.second.clone());
         }
@@ -193,18 +202,20 @@ impl Checkpoint {
             path: path.clone(),
             reason: error.to_string(),
         })?;
-        let bytes =
-            safetensors::serialize(&tensors, Some(HashMap::from([(STATE.to_owned(), state)])))
-                .map_err(|error| TrainError::Checkpoint {
-                    path: path.clone(),
-                    reason: error.to_string(),
-                })?;
+        let header = HashMap::from([(STATE.to_owned(), state)]);
+        let bytes = safetensors::serialize(&tensors, Some(header)).map_err(|error| {
+            TrainError::Checkpoint {
+                path: path.clone(),
+                reason: error.to_string(),
+            }
+        })?;
         write_atomically(&path, &bytes).map_err(|source| TrainError::Io { path, source })
     }
 }
 
 fn weights_of(adam: &Adam) -> Result<HashMap<String, Tensor>, TrainError> {
-    // Copied: `Var::set` writes in place, so a shared tensor would follow the training.
+    // `Var::set` writes in place, so a tensor that is shared instead of copied would change as the
+    // training goes on.
     adam.slots
         .iter()
         .map(|slot| Ok((slot.name.clone(), slot.variable.as_tensor().copy()?)))

@@ -1,7 +1,8 @@
 //! The settings of a run, and the recall it watches.
 
+use super::augment::Augmentation;
+use super::error::TrainError;
 use super::schedule::Schedule;
-use super::{Augmentation, TrainError};
 use serde::{Deserialize, Serialize};
 
 /// Settings of a run (paper III-F and IV-B where a number is given there).
@@ -46,6 +47,9 @@ impl Default for TrainConfig {
 
 impl TrainConfig {
     /// Refuses settings that are out of range.
+    ///
+    /// # Errors
+    /// A setting is out of range.
     pub fn check(&self) -> Result<(), TrainError> {
         self.schedule.check()?;
         self.augmentation.check()?;

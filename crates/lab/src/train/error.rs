@@ -35,6 +35,9 @@ pub enum TrainError {
         /// What the system said.
         source: std::io::Error,
     },
+    /// A data set could not be read.
+    #[error(transparent)]
+    Dataset(#[from] crate::datasets::DatasetError),
     /// The model refused an image or a file.
     #[error(transparent)]
     Extract(#[from] placeformer_vision::extract::ExtractError),

@@ -1,10 +1,11 @@
 //! Training the head alone: images are encoded once, so that a step costs a matrix product.
 
 use super::config::TrainConfig;
+use super::error::TrainError;
 use super::loss::normalise_rows;
-use super::trainer::{Sample, Session, TripletModel, run};
+use super::model::{Sample, TripletModel};
+use super::trainer::{Outcome, Session, run};
 use super::triplets::{Side, TripletSet};
-use super::{Outcome, TrainError};
 use candle_core::{Device, Tensor, Var};
 
 /// A linear head over cached pooled tokens.
@@ -23,6 +24,9 @@ pub struct PooledTokens {
 
 impl PooledTokens {
     /// Takes rows of `dim` values for every query and every database image, in the set's order.
+    ///
+    /// # Errors
+    /// The values do not fill the rows.
     pub fn new(dim: usize, queries: Vec<f32>, database: Vec<f32>) -> Result<Self, TrainError> {
         let matrix = |values: Vec<f32>| {
             Tensor::from_vec(values.clone(), (values.len() / dim, dim), &Device::Cpu)
@@ -43,6 +47,9 @@ impl PooledTokens {
 
 impl HeadModel {
     /// Starts from a head: `weight` is `[outputs, dim]` row-major, `bias` `[outputs]`.
+    ///
+    /// # Errors
+    /// The values do not fill the rows.
     pub fn new(
         weight: &[f32],
         bias: &[f32],
@@ -61,6 +68,10 @@ impl HeadModel {
     }
 
     /// Trains in place; afterwards the weights are the best seen.
+    ///
+    /// # Errors
+    /// A setting is out of range, the checkpoint is one of another run, or the loss is no longer
+    /// finite.
     pub fn train(
         &self,
         training: &TripletSet,
@@ -81,6 +92,9 @@ impl HeadModel {
     }
 
     /// The weights, `[outputs, dim]` row-major, and the bias, `[outputs]`.
+    ///
+    /// # Errors
+    /// The tensor library fails.
     pub fn weights(&self) -> Result<(Vec<f32>, Vec<f32>), TrainError> {
         Ok((self.weight.flatten_all()?.to_vec1()?, self.bias.to_vec1()?))
     }

@@ -4,7 +4,7 @@
 //! blocks of ground are held out, or the last part of a drive, and what lies between the two sides
 //! is given to neither.
 
-use super::TrainError;
+use super::error::TrainError;
 use crate::datasets::{Dataset, Item, NeighbourGrid, Truth};
 use placeformer_core::geography::MetricPoint;
 use rand::SeedableRng;
@@ -64,43 +64,39 @@ impl Holdout {
                 *blocks.entry(block).or_default() += 1;
             }
         }
-        if blocks.len() < 2 {
-            let reason = match blocks.len() {
-                0 => "no image has a position".to_owned(),
-                _ => format!(
-                    "all images lie in one block of {} m, so no place can be held out",
-                    self.block_m
-                ),
-            };
-            return Err(TrainError::NoTriplets(format!(
-                "{}: {reason}",
-                dataset.name
-            )));
+        let too_few = match blocks.len() {
+            0 => Some("no image has a position".to_owned()),
+            1 => Some(format!(
+                "all images lie in one block of {} m, so no place can be held out",
+                self.block_m
+            )),
+            _ => None,
+        };
+        if let Some(reason) = too_few {
+            let reason = format!("{}: {reason}", dataset.name);
+            return Err(TrainError::NoTriplets(reason));
         }
+
         let held_out = self.draw(&blocks);
         let is_held_out = |item: &Item| {
             self.block(item)
                 .is_some_and(|block| held_out.contains_key(&block))
         };
         let validation = subset(dataset, is_held_out);
-        let kept_back: Vec<(&Item, MetricPoint)> = validation
-            .database
-            .iter()
-            .chain(&validation.queries)
+        let both_sides = validation.database.iter().chain(&validation.queries);
+        let kept_back: Vec<(&Item, MetricPoint)> = both_sides
             .filter_map(|item| Some((item, item.position?)))
             .collect();
-        let grid = NeighbourGrid::new(
-            self.gap_m.max(1e-3),
-            kept_back.iter().map(|item| item.1).enumerate(),
-        );
-        let is_apart = |item: &Item| {
-            item.position.is_some_and(|point| {
-                !grid
-                    .within(point)
-                    .any(|near| kept_back[near].0.group == item.group)
-            })
+        let points = kept_back.iter().map(|item| item.1);
+        let grid = NeighbourGrid::new(self.gap_m.max(1e-3), points.enumerate());
+        let is_apart = |item: &Item| match item.position {
+            Some(point) => grid
+                .within(point)
+                .all(|near| kept_back[near].0.group != item.group),
+            None => false,
         };
-        Ok((subset(dataset, is_apart), validation))
+        let training = subset(dataset, is_apart);
+        Ok((training, validation))
     }
 
     /// Splits drives (frames in order): the last share of each is held out, behind a gap.
@@ -179,7 +175,8 @@ mod tests {
                 .map(|(i, &(east, north))| item(format!("{side}{i}"), east, north))
                 .collect()
         };
-        let (database, queries) = (side("d"), side("q"));
+        let database = side("d");
+        let queries = side("q");
         let truth = vec![Truth::Unknown; queries.len()];
         Dataset {
             name: "field".into(),
@@ -212,8 +209,10 @@ mod tests {
             prop_assert!(!validation.database.is_empty());
             for learnt in training.database.iter().chain(&training.queries) {
                 for held_out in validation.database.iter().chain(&validation.queries) {
-                    let (a, b) = (learnt.position.unwrap(), held_out.position.unwrap());
-                    let (east, north) = (a.east - b.east, a.north - b.north);
+                    let a = learnt.position.unwrap();
+                    let b = held_out.position.unwrap();
+                    let east = a.east - b.east;
+                    let north = a.north - b.north;
                     prop_assert!(east * east + north * north > 25.0 * 25.0);
                 }
             }

@@ -1,7 +1,7 @@
 //! The diary of a run: one JSON line a cycle.
 
-use super::TrainError;
 use super::config::ValidationRecall;
+use super::error::TrainError;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, Write};
@@ -73,6 +73,9 @@ impl TrainLog {
 }
 
 /// Every cycle of the run in `folder`; a last line cut off by a kill is passed over.
+///
+/// # Errors
+/// The file cannot be read, or a line of it is no record.
 pub fn read_log(folder: &Path) -> Result<Vec<CycleRecord>, TrainError> {
     let path = folder.join(FILE);
     let io = |source| TrainError::Io {

@@ -6,7 +6,8 @@
 //! else is embedded, so a cycle costs the same however large the data are, and every image gets its
 //! turn.
 
-use super::TrainError;
+use super::embed::Embeddings;
+use super::error::TrainError;
 use super::triplets::{Side, TripletSet};
 use placeformer_vision::extract::squared_distance;
 use rand::SeedableRng;
@@ -14,41 +15,6 @@ use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use std::collections::HashMap;
-
-/// Descriptors of the images that were embedded, by image.
-pub(super) struct Embeddings {
-    dim: usize,
-    rows: Vec<f32>,
-    places: HashMap<(Side, u32), usize>,
-}
-
-impl Embeddings {
-    /// Takes the rows, `[rows, dim]`, and which of them is an image's.
-    pub(super) fn new(dim: usize, rows: Vec<f32>, places: HashMap<(Side, u32), usize>) -> Self {
-        Self { dim, rows, places }
-    }
-
-    /// The descriptor of an image.
-    ///
-    /// # Errors
-    /// It is not among those embedded.
-    pub(super) fn of(&self, side: Side, index: u32) -> Result<&[f32], TrainError> {
-        let place = self.places.get(&(side, index)).ok_or_else(|| {
-            TrainError::Tensor(format!(
-                "{side:?} image {index} was not embedded in this cycle"
-            ))
-        })?;
-        Ok(&self.rows[place * self.dim..(place + 1) * self.dim])
-    }
-
-    /// Descriptors of several database images, each with its index.
-    pub(super) fn of_database(&self, indices: &[u32]) -> Result<Vec<(u32, &[f32])>, TrainError> {
-        indices
-            .iter()
-            .map(|&index| Ok((index, self.of(Side::Database, index)?)))
-            .collect()
-    }
-}
 
 /// The `count` hardest negatives of every query of `queries` among the images of `pool`, hardest
 /// first.

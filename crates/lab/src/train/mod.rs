@@ -2,8 +2,9 @@
 //!
 //! ```text
 //! data set --triplets--> positives within 10 m, the rest beyond 25 m
-//!    cycle: draw the queries, embed them, their positives and a pool --mining--> hardest negatives of each query
-//!           N steps of triplets --loss--> --adam--> weights      (learning rate by schedule)
+//!    cycle: draw the queries; embed them, their positives and a pool
+//!           --mining--> the hardest negatives of each query
+//!           N steps of triplets --loss--> --adam--> weights  (learning rate by schedule)
 //!           validation recall --> best weights kept, stop when it no longer improves
 //!           checkpoint (weights, moments, counters), log line
 //! ```
@@ -15,11 +16,13 @@
 //!
 //! | module | holds |
 //! |---|---|
-//! | `triplets` | which images are positives, which may be negatives |
+//! | `sources`, `triplets` | the images; which are positives, which may be negatives |
 //! | `holdout` | which places are kept back for validation |
 //! | `mining` | the negatives that look most like the query |
-//! | `loss`, `adam`, `schedule` | one step |
-//! | `head`, `backbone` | the two things that can be trained |
+//! | `embed`, `validation` | descriptors of many images; recall on held-out places |
+//! | `cycle`, `loss`, `adam`, `schedule` | the steps between two minings |
+//! | `model`, `head`, `backbone` | what can be trained: the head, or blocks of the backbone too |
+//! | `fit` | a head without labels, to start from |
 //! | `pooled_cache` | what a head is trained on, kept on disk |
 //! | `augment` | photometric and geometric variation of training images |
 //! | `trainer`, `config`, `checkpoint`, `log` | the loop, its settings, its memory and its diary |
@@ -30,26 +33,36 @@ mod augment;
 mod backbone;
 mod checkpoint;
 mod config;
+mod cycle;
+mod embed;
 mod error;
+mod fit;
 mod head;
 mod holdout;
+#[cfg(test)]
+mod interruption;
 mod log;
 mod loss;
 mod mining;
+mod model;
 mod pooled_cache;
 pub mod report;
 mod schedule;
+mod sources;
 mod trainer;
 mod triplets;
+mod validation;
 
 pub use augment::{Augmentation, augment};
 pub use backbone::{BackboneModel, TrainableBlocks};
 pub use config::{TrainConfig, ValidationRecall};
 pub use error::TrainError;
+pub use fit::{AggregateChoice, FittedHead, SetTokens, fit_head, starting_head};
 pub use head::{HeadModel, PooledTokens};
 pub use holdout::{Drives, Holdout};
 pub use log::{CycleRecord, read_log};
 pub use pooled_cache::PooledCache;
 pub use schedule::Schedule;
-pub use trainer::{Outcome, Progress, Session};
+pub use sources::{Sources, TripletRule, refuse_shared_images};
+pub use trainer::{Outcome, Session};
 pub use triplets::{Side, TripletSet};

@@ -6,7 +6,8 @@
 //! the vector, and a CRC-32. A segment is read up to its first damaged record, which is where a
 //! killed process stopped.
 
-use super::TrainError;
+use super::error::TrainError;
+use placeformer_core::progress::Task;
 use placeformer_core::types::{ContentHash, ImageTensor};
 use placeformer_vision::extract::Extractor;
 use placeformer_vision::image::{ImageConfig, load_tensor};
@@ -24,6 +25,17 @@ const NAMED: usize = 5;
 /// Images to their vectors.
 type Encode<'a> = dyn Fn(&[ImageTensor]) -> Result<Vec<Vec<f32>>, TrainError> + 'a;
 
+/// The bytes of an image to a tensor, or what is wrong with them.
+type Decode<'a> = dyn Fn(&[u8]) -> Result<ImageTensor, String> + Sync + 'a;
+
+/// An image as it was read.
+struct FoundImage {
+    /// SHA-256 of its content.
+    hash: [u8; 32],
+    /// `None` if its vector is known.
+    tensor: Option<ImageTensor>,
+}
+
 /// The vectors of one way of pooling.
 pub struct PooledCache {
     folder: PathBuf,
@@ -34,9 +46,13 @@ pub struct PooledCache {
 
 impl PooledCache {
     /// Opens the vectors of `extractor`'s tokens below `root`.
+    ///
+    /// # Errors
+    /// The folder cannot be read or written.
     pub fn open(root: &Path, extractor: &Extractor) -> Result<Self, TrainError> {
         let aggregate = extractor.aggregate();
-        let (backbone, size) = (extractor.backbone(), extractor.input_size());
+        let backbone = extractor.backbone();
+        let size = extractor.input_size();
         // The encoder too: precisions compare well enough to search with, but a run repeats only on
         // the same bits.
         let name = format!("{backbone}:{size}:{}:{aggregate}", extractor.encoder_name());
@@ -59,18 +75,15 @@ impl PooledCache {
         };
         for entry in fs::read_dir(&folder).map_err(io)? {
             let path = entry.map_err(io)?.path();
-            if path
-                .extension()
-                .is_some_and(|extension| extension == "pooled")
-            {
+            if path.extension().is_some_and(|end| end == "pooled") {
                 cache.read_segment(&fs::read(&path).map_err(io)?);
             }
         }
         Ok(cache)
     }
 
-    /// The vectors `[images, dim]` of `images`, in their order; `progress` is told how many more
-    /// are done.
+    /// The vectors `[images, dim]` of `images`, in their order; `task` advances by
+    /// each image.
     ///
     /// # Errors
     /// An image cannot be read; all such images are found before the error is returned.
@@ -78,7 +91,7 @@ impl PooledCache {
         &mut self,
         extractor: &Extractor,
         images: &[PathBuf],
-        progress: &dyn Fn(u64),
+        task: &Task<'_>,
     ) -> Result<Vec<f32>, TrainError> {
         let limits = ImageConfig::default();
         let decode = |bytes: &[u8]| {
@@ -88,41 +101,33 @@ impl PooledCache {
             images,
             &decode,
             &|tensors| Ok(extractor.pooled(tensors)?),
-            progress,
+            task,
         )
     }
 
     fn pool_with(
         &mut self,
         images: &[PathBuf],
-        decode: &(dyn Fn(&[u8]) -> Result<ImageTensor, String> + Sync),
+        decode: &Decode<'_>,
         encode: &Encode<'_>,
-        progress: &dyn Fn(u64),
+        task: &Task<'_>,
     ) -> Result<Vec<f32>, TrainError> {
-        let (mut rows, mut unreadable) = (Vec::with_capacity(images.len() * self.dim), Vec::new());
+        let mut rows = Vec::with_capacity(images.len() * self.dim);
+        let mut unreadable = Vec::new();
         for batch in images.chunks(BATCH) {
-            let read = |path: &PathBuf| -> Result<([u8; 32], Option<ImageTensor>), String> {
-                let bytes =
-                    fs::read(path).map_err(|error| format!("{}: {error}", path.display()))?;
-                let hash = ContentHash::of(&bytes).0;
-                let decode =
-                    || decode(&bytes).map_err(|error| format!("{}: {error}", path.display()));
-                Ok((
-                    hash,
-                    if self.known.contains_key(&hash) {
-                        None
-                    } else {
-                        Some(decode()?)
-                    },
-                ))
-            };
-            let (mut hashes, mut missing, mut tensors) = (Vec::new(), Vec::new(), Vec::new());
-            for found in batch.par_iter().map(read).collect::<Vec<_>>() {
-                match found {
-                    Ok((hash, tensor)) => {
-                        hashes.push(hash);
-                        if let Some(tensor) = tensor {
-                            missing.push(hash);
+            let found: Vec<Result<FoundImage, String>> = batch
+                .par_iter()
+                .map(|path| self.find(path, decode))
+                .collect();
+            let mut hashes = Vec::new();
+            let mut missing = Vec::new();
+            let mut tensors = Vec::new();
+            for image in found {
+                match image {
+                    Ok(image) => {
+                        hashes.push(image.hash);
+                        if let Some(tensor) = image.tensor {
+                            missing.push(image.hash);
                             tensors.push(tensor);
                         }
                     }
@@ -132,27 +137,29 @@ impl PooledCache {
             if !tensors.is_empty() {
                 self.add(missing, encode(&tensors)?)?;
             }
-            rows.extend(
-                hashes
-                    .iter()
-                    .filter_map(|hash| self.known.get(hash))
-                    .flatten(),
-            );
-            progress(batch.len() as u64);
+            for hash in &hashes {
+                rows.extend(self.known.get(hash).into_iter().flatten());
+            }
+            task.add(batch.len() as u64);
         }
         if unreadable.is_empty() {
-            return Ok(rows);
-        }
-        let more = if unreadable.len() > NAMED {
-            "; and others"
+            Ok(rows)
         } else {
-            ""
+            Err(unreadable_images(&unreadable))
+        }
+    }
+
+    /// Reads an image, and decodes it unless its vector is known.
+    fn find(&self, path: &Path, decode: &Decode<'_>) -> Result<FoundImage, String> {
+        let named = |reason: String| format!("{}: {reason}", path.display());
+        let bytes = fs::read(path).map_err(|error| named(error.to_string()))?;
+        let hash = ContentHash::of(&bytes).0;
+        let tensor = if self.known.contains_key(&hash) {
+            None
+        } else {
+            Some(decode(&bytes).map_err(named)?)
         };
-        let named = unreadable[..unreadable.len().min(NAMED)].join("; ");
-        Err(TrainError::Setting(format!(
-            "{} images cannot be read: {named}{more}",
-            unreadable.len()
-        )))
+        Ok(FoundImage { hash, tensor })
     }
 
     fn add(&mut self, hashes: Vec<[u8; 32]>, vectors: Vec<Vec<f32>>) -> Result<(), TrainError> {
@@ -211,9 +218,24 @@ fn new_segment(folder: &Path) -> std::io::Result<File> {
     }
 }
 
+/// Names the first few.
+fn unreadable_images(reasons: &[String]) -> TrainError {
+    let named = reasons[..reasons.len().min(NAMED)].join("; ");
+    let more = if reasons.len() > NAMED {
+        "; and others"
+    } else {
+        ""
+    };
+    TrainError::Setting(format!(
+        "{} images cannot be read: {named}{more}",
+        reasons.len()
+    ))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use placeformer_core::progress::Silent;
     use placeformer_core::types::ImageSize;
     use std::cell::Cell;
 
@@ -241,7 +263,7 @@ mod tests {
             images,
             &decode,
             &encode,
-            &|_| {},
+            &Task::begin(&Silent, "describing", images.len() as u64),
         )
     }
 
@@ -292,11 +314,9 @@ mod tests {
     #[test]
     fn every_unreadable_image_is_found_before_the_run_gives_up() {
         let root = tempfile::tempdir().unwrap();
-        let (good, short, absent) = (
-            root.path().join("a"),
-            root.path().join("b"),
-            root.path().join("c"),
-        );
+        let good = root.path().join("a");
+        let short = root.path().join("b");
+        let absent = root.path().join("c");
         fs::write(&good, [1, 2]).unwrap();
         fs::write(&short, [1]).unwrap();
         let error = pool(

@@ -1,7 +1,10 @@
 //! A run as one self-contained page: what was learnt from, how loss and recall went, what came out.
 
-use super::{CycleRecord, Outcome, TrainConfig, ValidationRecall};
-use crate::eval::report::{LineChart, Series, escape, page, table};
+use super::config::{TrainConfig, ValidationRecall};
+use super::log::CycleRecord;
+use super::trainer::Outcome;
+use crate::eval::report::{LineChart, Series, page, table};
+use maud::{Markup, html};
 
 /// The page. `facts` are lines of a table: what was trained on what.
 pub fn html(
@@ -10,10 +13,7 @@ pub fn html(
     records: &[CycleRecord],
     outcome: &Outcome,
 ) -> String {
-    let mut body = format!("<p class=\"lead\">{}</p>\n", escape(&verdict(outcome)));
-    body += &recall_table(outcome);
-    body += "<h2>Curves</h2>\n<div class=\"plots\">";
-    for (chart, caption) in [
+    let figures = [
         (
             recall_chart(records, outcome),
             "Recall on places that are not learnt from, after each cycle.",
@@ -26,21 +26,29 @@ pub fn html(
             rate_chart(records),
             "Learning rate at the end of each cycle.",
         ),
-    ] {
-        body += &format!(
-            "<figure>{}<figcaption>{}</figcaption></figure>\n",
-            chart.render(),
-            escape(caption)
-        );
-    }
-    body += "</div>\n<h2>The run</h2>\n";
-    let rows: Vec<Vec<String>> = facts
+    ];
+    let facts: Vec<Vec<&String>> = facts
         .iter()
-        .map(|(name, value)| vec![escape(name), escape(value)])
+        .map(|(name, value)| vec![name, value])
         .collect();
-    body += &table("", &["", ""], &rows);
     let settings = serde_json::to_string_pretty(config).unwrap_or_default();
-    body += &format!("<h2>Settings</h2>\n<pre>{}</pre>\n", escape(&settings));
+    let body = html! {
+        p.lead { (verdict(outcome)) }
+        (recall_table(outcome))
+        h2 { "Curves" }
+        div.plots {
+            @for (chart, caption) in figures {
+                figure {
+                    (chart.render())
+                    figcaption { (caption) }
+                }
+            }
+        }
+        h2 { "The run" }
+        (table("", &["", ""], &facts))
+        h2 { "Settings" }
+        pre { (settings) }
+    };
     page("Training", &body)
 }
 
@@ -51,19 +59,18 @@ pub fn verdict(outcome: &Outcome) -> String {
     } else {
         "ran to the end of its schedule"
     };
-    let gain = match outcome.best == outcome.initial {
-        true => "validation never improved, so the weights are those it started from".to_owned(),
-        false => {
-            format!(
-                "validation recall@1 went from {:.1} to {:.1} percent",
-                outcome.initial.at_1, outcome.best.at_1
-            )
-        }
+    let gain = if outcome.best == outcome.initial {
+        "validation never improved, so the weights are those it started from".to_owned()
+    } else {
+        format!(
+            "validation recall@1 went from {:.1} to {:.1} percent",
+            outcome.initial.at_1, outcome.best.at_1
+        )
     };
     format!("The run {end} after {} steps; {gain}.", outcome.steps)
 }
 
-fn recall_table(outcome: &Outcome) -> String {
+fn recall_table(outcome: &Outcome) -> Markup {
     let row = |name: &str, recall: &ValidationRecall| {
         let mut cells = vec![name.to_owned()];
         cells.extend([recall.at_1, recall.at_5, recall.at_10].map(|value| format!("{value:.1}")));

@@ -1,6 +1,6 @@
 //! The learning rate over the run: linear warm-up, then half a cosine down to zero.
 
-use super::TrainError;
+use super::error::TrainError;
 use serde::{Deserialize, Serialize};
 
 /// Cosine schedule with warm-up.

@@ -1,7 +1,7 @@
 //! Which images show a query's place, and which may serve as its negatives (paper III-F: 10 m and
 //! 25 m).
 
-use super::TrainError;
+use super::error::TrainError;
 use crate::datasets::{Dataset, Item, NeighbourGrid};
 use placeformer_core::geography::MetricPoint;
 use placeformer_core::types::ContentHash;
@@ -10,18 +10,18 @@ use std::path::PathBuf;
 /// One side of a triplet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Side {
-    /// An image that asks.
+    /// A query image.
     Query,
-    /// An image that answers: positive or negative.
+    /// A database image: a positive or a negative.
     Database,
 }
 
 /// The images to learn from and their relations, computed once.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TripletSet {
-    /// Images that ask.
+    /// Query images.
     pub queries: Vec<PathBuf>,
-    /// Images that answer.
+    /// Database images.
     pub database: Vec<PathBuf>,
     /// For each query, the database images that show its place, ascending.
     pub positives: Vec<Vec<u32>>,
@@ -34,6 +34,9 @@ impl TripletSet {
     /// Relations by position: positives within `positive_m` metres, negatives beyond `negative_m`.
     ///
     /// Images without a position are left out.
+    ///
+    /// # Errors
+    /// The distances are out of order, or no query has both a positive and a negative.
     pub fn by_position(
         dataset: &Dataset,
         positive_m: f64,
@@ -41,10 +44,12 @@ impl TripletSet {
     ) -> Result<Self, TrainError> {
         if !(positive_m > 0.0 && positive_m <= negative_m && negative_m.is_finite()) {
             return Err(TrainError::Setting(format!(
-                "positives within {positive_m} m and negatives beyond {negative_m} m leave no order between them"
+                "positives within {positive_m} m and negatives beyond {negative_m} m \
+                 leave no order between them"
             )));
         }
-        let (queries, database) = (located(&dataset.queries), located(&dataset.database));
+        let queries = located(&dataset.queries);
+        let database = located(&dataset.database);
         let near_of = |radius: f64| -> Vec<Vec<u32>> {
             let grid = NeighbourGrid::new(radius, database.iter().map(|item| item.1).enumerate());
             let around = |(query, point): &(&Item, MetricPoint)| {
@@ -60,7 +65,8 @@ impl TripletSet {
             };
             queries.iter().map(around).collect()
         };
-        let (positives, near) = (near_of(positive_m), near_of(negative_m));
+        let positives = near_of(positive_m);
+        let near = near_of(negative_m);
         let paths =
             |items: &[(&Item, MetricPoint)]| items.iter().map(|item| item.0.path.clone()).collect();
         Self {
@@ -75,6 +81,9 @@ impl TripletSet {
     /// Relations by order, for drives whose frames carry no position: a frame's neighbours up to
     /// `positive_frames` away show its place, frames of its drive more than `negative_frames` away
     /// or of another drive do not.
+    ///
+    /// # Errors
+    /// The distances are out of order, or no query has both a positive and a negative.
     pub fn by_order(
         drives: &[Vec<PathBuf>],
         positive_frames: usize,
@@ -82,11 +91,13 @@ impl TripletSet {
     ) -> Result<Self, TrainError> {
         if positive_frames == 0 || positive_frames > negative_frames {
             return Err(TrainError::Setting(format!(
-                "positives within {positive_frames} frames and negatives beyond {negative_frames} leave no order between them"
+                "positives within {positive_frames} frames and negatives beyond \
+                 {negative_frames} leave no order between them"
             )));
         }
         let images: Vec<PathBuf> = drives.iter().flatten().cloned().collect();
-        let (mut positives, mut near) = (Vec::new(), Vec::new());
+        let mut positives = Vec::new();
+        let mut near = Vec::new();
         let mut first = 0;
         for drive in drives {
             for frame in 0..drive.len() {
@@ -145,14 +156,16 @@ impl TripletSet {
         let mut bytes = Vec::new();
         for paths in [&self.queries, &self.database] {
             bytes.extend((paths.len() as u64).to_le_bytes());
-            paths.iter().for_each(|path| {
-                bytes.extend(path.as_os_str().as_encoded_bytes().iter().chain(&[0]))
-            });
+            for path in paths {
+                bytes.extend(path.as_os_str().as_encoded_bytes());
+                bytes.push(0);
+            }
         }
         for row in self.positives.iter().chain(&self.near) {
             bytes.extend((row.len() as u32).to_le_bytes());
-            row.iter()
-                .for_each(|index| bytes.extend(index.to_le_bytes()));
+            for index in row {
+                bytes.extend(index.to_le_bytes());
+            }
         }
         ContentHash::of(&bytes).to_string()
     }

@@ -1,6 +1,6 @@
 //! What is done to key patches after extraction, so that rows of a table can share one.
 
-use super::EvalError;
+use crate::eval::error::EvalError;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 use placeformer_core::types::{PackedPatches, SCALES};
 

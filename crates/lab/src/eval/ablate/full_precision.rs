@@ -5,12 +5,12 @@
 //! once more and held in memory. The similarities are a plain matrix product; pairs are verified by
 //! the same homographies.
 
-use super::EvalError;
 use crate::datasets::{Dataset, Item};
+use crate::eval::error::EvalError;
 use crate::eval::features::Describe;
 use crate::eval::run::{Answer, Candidate, Neighbour};
-use indicatif::ProgressBar;
 use nalgebra::DMatrix;
+use placeformer_core::progress::Task;
 use placeformer_core::types::{KeyPatches, SCALES, ScaleSet};
 use placeformer_vision::rerank::{CombinationScore, PairScore, RerankConfig, Reranker};
 use rayon::prelude::*;
@@ -33,14 +33,15 @@ pub(super) fn rerank_all(
     answers: &[Answer],
     config: &RerankConfig,
     memory_bytes: u64,
-    progress: &ProgressBar,
+    task: &Task<'_>,
 ) -> Result<Option<FullPrecision>, EvalError> {
     let candidates: BTreeSet<usize> = answers
         .iter()
         .flat_map(|answer| &answer.global)
         .map(|n| n.index)
         .collect();
-    let (mut database, mut bytes) = (BTreeMap::new(), 0);
+    let mut database = BTreeMap::new();
+    let mut bytes = 0;
     for &index in &candidates {
         let whole = Whole::of(&describe(describer, &dataset.database[index])?);
         bytes += whole.bytes();
@@ -51,13 +52,15 @@ pub(super) fn rerank_all(
         }
         database.insert(index, whole);
     }
-    let (reranker, mut seconds, mut reranked) = (Reranker::new(config.clone()), 0.0, Vec::new());
+    let reranker = Reranker::new(config.clone());
+    let mut seconds = 0.0;
+    let mut reranked = Vec::new();
     for answer in answers {
         let query = Whole::of(&describe(describer, &dataset.queries[answer.query])?);
         let started = Instant::now();
         reranked.push(rerank(&reranker, &query, &database, answer));
         seconds += started.elapsed().as_secs_f64();
-        progress.inc(1);
+        task.add(1);
     }
     let mean = |sum: f64, count: usize| sum / count.max(1) as f64;
     let extra_bytes = mean(bytes as f64 * 0.75, database.len());
@@ -228,10 +231,8 @@ mod tests {
             patch_px: 14,
             stride: PoolingStride::Kernel,
         };
-        let (mut place, mut noise) = (
-            ChaCha8Rng::seed_from_u64(5),
-            ChaCha8Rng::seed_from_u64(seed),
-        );
+        let mut place = ChaCha8Rng::seed_from_u64(5);
+        let mut noise = ChaCha8Rng::seed_from_u64(seed);
         let mut scale = |columns: u32, count: u32, shift: u32| {
             let mut descriptors = Vec::new();
             for _ in 0..count {
@@ -258,9 +259,11 @@ mod tests {
 
     #[test]
     fn full_precision_and_int8_agree_where_the_nearest_is_clear() {
-        let (query, reference) = (seen(0, 1), seen(2, 2));
+        let query = seen(0, 1);
+        let reference = seen(2, 2);
         let reranker = Reranker::new(RerankConfig::default());
-        let (a, b) = (Whole::of(&query), Whole::of(&reference));
+        let a = Whole::of(&query);
+        let b = Whole::of(&reference);
         let full = a.score(&a.descriptors.transpose(), &b, &reranker);
         let packed = reranker.score(&pack(&query), &pack(&reference));
         assert_eq!(full, packed);

@@ -1,15 +1,35 @@
 //! The cuts by hand, the axes, and the whole table on a made-up model.
 
 use super::cuts::{coarsen, limit};
+use super::variants::{ALL_PATCHES, SIZE_ROWS};
 use super::*;
 use crate::datasets::Item;
 use half::f16;
+use placeformer_core::progress::{Silent, Step};
 use placeformer_core::types::{
-    ContentHash, Descriptor, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid,
-    PoolingStride, ScaleKeyPatches,
+    ContentHash, Descriptor, ImageSize, ImageTensor, KeyPatches, ModelId, PackedPatches, PatchGrid,
+    PoolingStride, SCALES, ScaleKeyPatches,
 };
+use placeformer_vision::extract::{HeadChoice, Preset};
+use placeformer_vision::rerank::RerankConfig;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Mutex;
+
+/// The last state of every task.
+#[derive(Default)]
+struct Totals(Mutex<BTreeMap<String, (u64, Option<u64>)>>);
+
+impl Progress for Totals {
+    fn update(&self, step: Step<'_>) {
+        let state = (step.done, step.total);
+        self.0.lock().unwrap().insert(step.task.to_owned(), state);
+    }
+
+    fn end(&self, _task: &str) {}
+}
 
 fn patches() -> PackedPatches {
     PackedPatches {
@@ -43,14 +63,13 @@ fn limits_cut_each_scale_for_itself() {
 #[test]
 fn coarse_codes_stay_within_half_a_step() {
     assert_eq!(coarsen(&patches(), 8), patches());
-    let (fine, coarse) = (patches(), coarsen(&patches(), 4));
+    let fine = patches();
+    let coarse = coarsen(&patches(), 4);
     for (row, (a, b)) in fine.codes.chunks(2).zip(coarse.codes.chunks(2)).enumerate() {
         assert!(b.iter().all(|code| code.abs() <= 7));
         for (a, b) in a.iter().zip(b) {
-            let (a, b) = (
-                f32::from(*a) * fine.factor[row],
-                f32::from(*b) * coarse.factor[row],
-            );
+            let a = f32::from(*a) * fine.factor[row];
+            let b = f32::from(*b) * coarse.factor[row];
             assert!((a - b).abs() <= coarse.factor[row] / 2.0 + 1e-5, "{a} {b}");
         }
     }
@@ -58,7 +77,8 @@ fn coarse_codes_stay_within_half_a_step() {
 
 #[test]
 fn each_axis_has_its_base_row_and_extractions_are_shared() {
-    let (extract, rerank) = (ExtractConfig::default(), RerankConfig::default());
+    let extract = ExtractConfig::default();
+    let rerank = RerankConfig::default();
     let base = Base {
         extract: &extract,
         rerank: &rerank,
@@ -270,7 +290,8 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
         skipped: vec![],
         notes: vec![],
     };
-    let (extract, rerank) = (ExtractConfig::default(), RerankConfig::default());
+    let extract = ExtractConfig::default();
+    let rerank = RerankConfig::default();
     let cache = folder.path().join("cache");
     let backbones = &[Preset::Dinov2Vits14];
     let base = Base {
@@ -281,9 +302,16 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
         cache: &cache,
         memory_bytes: 1 << 20,
     };
-    let hidden = MultiProgress::with_draw_target(indicatif::ProgressDrawTarget::hidden());
-    let Ablation { rows, left_out } = ablate(&dataset, &base, &open, &hidden).unwrap();
+    let totals = Totals::default();
+    let Ablation { rows, left_out } = ablate(&dataset, &base, &open, &totals).unwrap();
     assert!(left_out.is_empty(), "{left_out:?}");
+    let totals = totals.0.into_inner().unwrap();
+    let expected = (rows.len() as u64, Some(rows.len() as u64));
+    assert_eq!(
+        (totals["settings"], totals["images"]),
+        (expected, (5, Some(5)))
+    );
+    let hidden = &Silent;
     let row = |axis: &str, setting: &str| {
         rows.iter()
             .find(|row| row.axis == axis && row.setting == setting)
@@ -315,20 +343,20 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
             ..bare(&few)
         },
         &open,
-        &hidden,
+        hidden,
     );
     let prepared = prepared.unwrap();
     for variant in few_rows {
         let Cut::Limits { tau, caps } = variant.cut else {
             panic!("{}", variant.setting)
         };
-        let cut = prepared.row(&dataset, &variant, &hidden).unwrap().unwrap();
+        let cut = prepared.row(&dataset, &variant, hidden).unwrap().unwrap();
         let config = ExtractConfig {
             tau,
             caps: caps.map(|cap| cap.min(1 << 16)),
             ..bare(&few)
         };
-        let own = Prepared::new(&dataset, &few_base, &config, &open, &hidden).unwrap();
+        let own = Prepared::new(&dataset, &few_base, &config, &open, hidden).unwrap();
         let own = own
             .row(
                 &dataset,
@@ -336,7 +364,7 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
                     cut: Cut::None,
                     ..variant
                 },
-                &hidden,
+                hidden,
             )
             .unwrap()
             .unwrap();
@@ -350,7 +378,8 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
     // A codec of fewer bits or components is smaller; the base is the same on every axis.
     assert!(row("codec", "int4 simulated").patch_bytes < row("codec", "int8 *").patch_bytes);
     // Full precision recalls as much here, and is left out where it would not fit.
-    let (full, int8) = (row("codec", "f32"), row("codec", "int8 *"));
+    let full = row("codec", "f32");
+    let int8 = row("codec", "int8 *");
     assert_eq!(full.recall, int8.recall);
     assert!(full.patch_bytes > 2.0 * int8.patch_bytes);
     let small = ablate(
@@ -360,7 +389,7 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
             ..base
         },
         &open,
-        &hidden,
+        hidden,
     )
     .unwrap();
     assert_eq!(small.rows.len() + 1, rows.len());

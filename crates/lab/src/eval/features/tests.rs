@@ -1,7 +1,10 @@
 //! The cache on made-up images: what is read again, what is computed anew, what is listed.
 
 use super::*;
-use placeformer_core::types::{ImageSize, PatchGrid, PoolingStride};
+use placeformer_core::progress::Silent;
+use placeformer_core::types::{
+    Descriptor, ImageSize, KeyPatches, ModelId, PatchGrid, PoolingStride,
+};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Describes an image by its first byte; refuses those that start with `!`.
@@ -100,7 +103,13 @@ fn run(
 ) -> (FeatureCache, Features) {
     let cache = FeatureCache::open(root, describer, 1 << 20).unwrap();
     let features = cache
-        .describe_all(describer, items, "database", kind, &ProgressBar::hidden())
+        .describe_all(
+            describer,
+            items,
+            "database",
+            kind,
+            &Task::begin(&Silent, "describing", items.len() as u64),
+        )
         .unwrap();
     (cache, features)
 }

@@ -1,6 +1,7 @@
-//! Dealing answers to the folds of a cross-validation: places stay whole, folds come out alike.
+//! Divides answers into the folds of a cross-validation, so that the answers of a place are in one
+//! fold, and folds have about as many right and wrong answers as each other.
 
-use super::calibration::TopOne;
+use super::answers::TopOne;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;

@@ -48,7 +48,9 @@ pub fn rejection(answers: &[Judged]) -> Rejection {
     let mut sorted = answers.to_vec();
     sorted.sort_unstable_by(|a, b| b.score.total_cmp(&a.score));
     let with_match = answers.iter().filter(|answer| answer.has_match).count();
-    let (mut curve, mut accepted, mut correct) = (Vec::new(), 0usize, 0usize);
+    let mut curve = Vec::new();
+    let mut accepted = 0usize;
+    let mut correct = 0usize;
     for same in sorted.chunk_by(|a, b| a.score.total_cmp(&b.score).is_eq()) {
         accepted += same.len();
         correct += same.iter().filter(|answer| answer.correct).count();

@@ -1,8 +1,9 @@
 //! The ablation table for a terminal and for the page.
 
-use super::html::{escape, table};
+use super::html::table;
 use crate::eval::ablate::AblationRow;
 use crate::eval::summary::AtK;
+use maud::{Markup, html};
 use std::fmt::Write;
 
 fn cell(recall: Option<&AtK<Option<f64>>>, k: usize) -> String {
@@ -12,15 +13,10 @@ fn cell(recall: Option<&AtK<Option<f64>>>, k: usize) -> String {
 }
 
 fn numbers(row: &AblationRow) -> Vec<String> {
-    let mut cells: Vec<String> = [1, 5, 10]
-        .iter()
-        .map(|&k| cell(Some(&row.recall.global), k))
-        .collect();
-    cells.extend(
-        [1, 5, 10]
-            .iter()
-            .map(|&k| cell(row.recall.reranked.as_ref(), k)),
-    );
+    let mut cells = Vec::new();
+    for recall in [Some(&row.recall.global), row.recall.reranked.as_ref()] {
+        cells.extend([1, 5, 10].map(|k| cell(recall, k)));
+    }
     cells.push(format!("{:.0}", row.extract_seconds * 1e3));
     cells.push(format!("{:.1}", row.rerank_seconds * 1e3));
     cells.push(format!("{:.0}", row.patch_bytes / 1e3));
@@ -47,7 +43,7 @@ pub fn ablation_text(rows: &[AblationRow]) -> String {
     }
     out.push('\n');
     for row in rows {
-        // Writing into a String cannot fail.
+        // Writing into a `String` cannot fail.
         let _ = write!(out, "{:<12}{:<18}", row.axis, row.setting);
         for cell in numbers(row) {
             let _ = write!(out, "{cell:>11}");
@@ -57,22 +53,20 @@ pub fn ablation_text(rows: &[AblationRow]) -> String {
     out
 }
 
-/// The same as an HTML table.
-pub fn ablation_html(rows: &[AblationRow]) -> String {
+/// The same for a page.
+pub fn ablation_html(rows: &[AblationRow]) -> Markup {
     let cells = |row: &AblationRow| {
-        let mut cells = vec![escape(row.axis), escape(&row.setting)];
+        let mut cells = vec![row.axis.to_owned(), row.setting.clone()];
         cells.extend(numbers(row));
         cells
     };
     let mut headers = vec!["axis", "setting"];
     headers.extend(HEADERS);
-    let caption = "One setting varied at a time; g marks the global ranking by the mean token, * the base setting";
-    format!(
-        "<h2>Ablation</h2>\n{}",
-        table(
-            caption,
-            &headers,
-            &rows.iter().map(cells).collect::<Vec<_>>()
-        )
-    )
+    let caption = "One setting varied at a time; g marks the global ranking by the mean token, \
+                   * the base setting";
+    let rows: Vec<Vec<String>> = rows.iter().map(cells).collect();
+    html! {
+        h2 { "Ablation" }
+        (table(caption, &headers, &rows))
+    }
 }

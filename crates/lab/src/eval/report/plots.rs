@@ -1,27 +1,23 @@
 //! The plots of an evaluation: recall over k, precision over recall, S of right and wrong answers,
 //! reliability.
 
-use super::html::escape;
 use super::svg::{Histogram, LineChart, Series};
 use crate::datasets::{Dataset, Truth};
+use crate::eval::answers::DatasetAnswers;
 use crate::eval::measure::{Rejection, ReliabilityBin, first_hit, recall_at};
 use crate::eval::run::Answer;
 use crate::eval::summary::Summary;
+use maud::{Markup, html};
 
 /// Longest list of answers the recall plot looks at.
 const RECALL_TO: usize = 25;
 
 /// All plots that the data allow, as figures.
-pub fn plots(
-    summary: &Summary,
-    dataset: &Dataset,
-    answers: &[Answer],
-    left_out: &[Answer],
-) -> String {
+pub fn plots(summary: &Summary, dataset: &Dataset, answers: &DatasetAnswers) -> Markup {
     let mut figures = Vec::new();
     if summary.queries_with_match > 0 {
         figures.push((
-            recall_plot(summary, dataset, answers),
+            recall_plot(summary, dataset, &answers.answers),
             "Share of queries with a right place among the first k.",
         ));
         figures.push((
@@ -31,27 +27,30 @@ pub fn plots(
     }
     if summary.recall.reranked.is_some() {
         figures.push((
-            score_plot(dataset, answers, left_out),
+            score_plot(dataset, answers),
             "S of the best answer, by whether it is right.",
         ));
     }
     if let Some(plot) = reliability_plot(summary) {
-        figures.push((plot, "Share of right answers by confidence, with the calibration error; the dashed line is ideal. What is fitted \
-             here is five-fold cross-validated."));
+        figures.push((
+            plot,
+            "Share of right answers by confidence, with the calibration error; the dashed line is \
+             ideal. What is fitted here is five-fold cross-validated.",
+        ));
     }
-    let figure = |(svg, caption): &(String, &str)| {
-        format!(
-            "<figure>{svg}<figcaption>{}</figcaption></figure>\n",
-            escape(caption)
-        )
-    };
-    format!(
-        "<div class=\"plots\">{}</div>\n",
-        figures.iter().map(figure).collect::<String>()
-    )
+    html! {
+        div.plots {
+            @for (svg, caption) in figures {
+                figure {
+                    (svg)
+                    figcaption { (caption) }
+                }
+            }
+        }
+    }
 }
 
-fn recall_plot(summary: &Summary, dataset: &Dataset, answers: &[Answer]) -> String {
+fn recall_plot(summary: &Summary, dataset: &Dataset, answers: &[Answer]) -> Markup {
     let hits = |ranking: fn(&Answer) -> Vec<usize>| -> Vec<Option<usize>> {
         let with_match = answers
             .iter()
@@ -86,17 +85,19 @@ fn recall_plot(summary: &Summary, dataset: &Dataset, answers: &[Answer]) -> Stri
         x_label: "k".into(),
         y_label: "recall, %".into(),
         x_range: (1.0, RECALL_TO as f64),
-        // Room for the differences, but always a round lower end.
-        y_range: (
-            (lowest / 20.0).floor().max(0.0) * 20.0 - if lowest >= 100.0 { 20.0 } else { 0.0 },
-            100.0,
-        ),
+        y_range: (round_below(lowest), 100.0),
         series,
     }
     .render()
 }
 
-fn rejection_plot(summary: &Summary) -> String {
+/// The lower end of an axis: a round number that leaves room for differences.
+fn round_below(lowest: f64) -> f64 {
+    let round = (lowest / 20.0).floor().max(0.0) * 20.0;
+    if lowest >= 100.0 { round - 20.0 } else { round }
+}
+
+fn rejection_plot(summary: &Summary) -> Markup {
     let line = |name: &str, class, rejection: &Rejection| {
         let points = rejection
             .curve
@@ -125,9 +126,11 @@ fn rejection_plot(summary: &Summary) -> String {
     .render()
 }
 
-fn score_plot(dataset: &Dataset, answers: &[Answer], left_out: &[Answer]) -> String {
-    let (mut right, mut wrong, mut none) = (Vec::new(), Vec::new(), Vec::new());
-    for answer in answers {
+fn score_plot(dataset: &Dataset, answers: &DatasetAnswers) -> Markup {
+    let mut right = Vec::new();
+    let mut wrong = Vec::new();
+    let mut none = Vec::new();
+    for answer in &answers.answers {
         let Some(best) = answer.reranked.first() else {
             continue;
         };
@@ -141,11 +144,11 @@ fn score_plot(dataset: &Dataset, answers: &[Answer], left_out: &[Answer]) -> Str
             Truth::Unknown => {}
         }
     }
-    none.extend(
-        left_out
-            .iter()
-            .filter_map(|answer| Some(f64::from(answer.reranked.first()?.score.spatial_score))),
-    );
+    for answer in &answers.left_out {
+        if let Some(best) = answer.reranked.first() {
+            none.push(f64::from(best.score.spatial_score));
+        }
+    }
     let series = [
         ("right", "a", right),
         ("wrong", "b", wrong),
@@ -165,7 +168,7 @@ fn score_plot(dataset: &Dataset, answers: &[Answer], left_out: &[Answer]) -> Str
     .render()
 }
 
-fn reliability_plot(summary: &Summary) -> Option<String> {
+fn reliability_plot(summary: &Summary) -> Option<Markup> {
     let line = |name: String, class, bins: &[ReliabilityBin]| {
         let points = bins
             .iter()

@@ -1,7 +1,7 @@
 //! Plots as inline SVG: no script, no external asset; colours come from the page's style sheet, so
 //! that they follow the reader's light or dark setting.
 
-use super::html::escape;
+use maud::{Markup, PreEscaped, html};
 use std::fmt::Write;
 
 const WIDTH: f64 = 460.0;
@@ -43,7 +43,7 @@ pub struct LineChart {
 
 impl LineChart {
     /// The chart as an `<svg>` element.
-    pub fn render(&self) -> String {
+    pub fn render(&self) -> Markup {
         let mut canvas = Canvas::new(&self.title, self.x_range, self.y_range);
         canvas.axes(
             &self.x_label,
@@ -78,14 +78,10 @@ pub struct Histogram {
 
 impl Histogram {
     /// The histogram as an `<svg>` element.
-    pub fn render(&self) -> String {
-        let all = || {
-            self.series
-                .iter()
-                .flat_map(|(_, _, values)| values.iter().copied())
-        };
-        let low = all().fold(0f64, f64::min);
-        let high = all().fold(low + 1.0, f64::max);
+    pub fn render(&self) -> Markup {
+        let values = self.series.iter().flat_map(|(_, _, values)| values);
+        let low = values.clone().copied().fold(0f64, f64::min);
+        let high = values.copied().fold(low + 1.0, f64::max);
         let bins = self.bins.max(1);
         let width = (high - low) / bins as f64;
         let count = |values: &[f64]| {
@@ -141,6 +137,11 @@ fn ticks((low, high): (f64, f64)) -> Vec<f64> {
     (first..=last).map(|i| i as f64 * step).collect()
 }
 
+/// Text made safe for content and for attributes in double quotes.
+fn escaped(text: &str) -> String {
+    html! { (text) }.into_string()
+}
+
 /// A number without needless digits.
 fn short(value: f64) -> String {
     let text = format!("{value:.3}");
@@ -152,18 +153,20 @@ fn short(value: f64) -> String {
     }
 }
 
+/// An `<svg>` element under construction, with the data ranges that its axes show.
 struct Canvas {
     svg: String,
     x_range: (f64, f64),
     y_range: (f64, f64),
 }
 
-// Writing into a String cannot fail, so the results of `write!` below are dropped.
+// Writing into a `String` cannot fail, so the results of `write!` below are dropped.
 impl Canvas {
     fn new(title: &str, x_range: (f64, f64), y_range: (f64, f64)) -> Self {
-        let title = escape(title);
+        let title = escaped(title);
         let svg = format!(
-            "<svg class=\"plot\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{title}\"><title>{title}</title>"
+            "<svg class=\"plot\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" \
+             aria-label=\"{title}\"><title>{title}</title>"
         );
         Self {
             svg,
@@ -185,9 +188,11 @@ impl Canvas {
     }
 
     fn axes(&mut self, x_label: &str, y_label: &str, x_ticks: &[f64], y_ticks: &[f64]) {
-        let (bottom, right) = (HEIGHT - BOTTOM, WIDTH - RIGHT);
+        let bottom = HEIGHT - BOTTOM;
+        let right = WIDTH - RIGHT;
         for &tick in y_ticks {
-            let (y, label) = (self.y(tick), short(tick));
+            let y = self.y(tick);
+            let label = short(tick);
             let _ = write!(
                 self.svg,
                 "<line class=\"grid\" x1=\"{LEFT}\" x2=\"{right}\" y1=\"{y:.1}\" y2=\"{y:.1}\"/>\
@@ -197,11 +202,13 @@ impl Canvas {
             );
         }
         for &tick in x_ticks {
-            let (x, label) = (self.x(tick), short(tick));
+            let x = self.x(tick);
+            let label = short(tick);
             let _ = write!(
                 self.svg,
                 "<line class=\"grid\" x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{bottom}\" y2=\"{:.1}\"/>\
-                 <text class=\"tick\" x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{label}</text>",
+                 <text class=\"tick\" x=\"{x:.1}\" y=\"{:.1}\" \
+                 text-anchor=\"middle\">{label}</text>",
                 bottom + 4.0,
                 bottom + 17.0
             );
@@ -210,12 +217,13 @@ impl Canvas {
             self.svg,
             "<line class=\"axis\" x1=\"{LEFT}\" x2=\"{right}\" y1=\"{bottom}\" y2=\"{bottom}\"/>\
              <text class=\"label\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>\
-             <text class=\"label\" transform=\"translate(13 {:.1}) rotate(-90)\" text-anchor=\"middle\">{}</text>",
+             <text class=\"label\" transform=\"translate(13 {:.1}) rotate(-90)\" \
+             text-anchor=\"middle\">{}</text>",
             (LEFT + right) / 2.0,
             HEIGHT - 10.0,
-            escape(x_label),
+            escaped(x_label),
             (TOP + bottom) / 2.0,
-            escape(y_label)
+            escaped(y_label)
         );
     }
 
@@ -235,7 +243,8 @@ impl Canvas {
             for &(x, y) in &series.points {
                 let _ = write!(
                     self.svg,
-                    "<circle class=\"dot {}\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"3.5\"><title>{}: {}</title></circle>",
+                    "<circle class=\"dot {}\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"3.5\">\
+                     <title>{}: {}</title></circle>",
                     series.class,
                     self.x(x),
                     self.y(y),
@@ -247,10 +256,14 @@ impl Canvas {
     }
 
     fn bar(&mut self, (start, end): (f64, f64), value: f64, class: &str) {
-        let (left, right, top, bottom) = (self.x(start), self.x(end), self.y(value), self.y(0.0));
+        let left = self.x(start);
+        let right = self.x(end);
+        let top = self.y(value);
+        let bottom = self.y(0.0);
         let _ = write!(
             self.svg,
-            "<rect class=\"bar {class}\" x=\"{:.1}\" y=\"{top:.1}\" width=\"{:.1}\" height=\"{:.1}\">\
+            "<rect class=\"bar {class}\" x=\"{:.1}\" y=\"{top:.1}\" \
+             width=\"{:.1}\" height=\"{:.1}\">\
              <title>{} to {}: {}</title></rect>",
             left + 0.5,
             (right - left - 1.0).max(0.5),
@@ -273,14 +286,14 @@ impl Canvas {
                 y - 9.0,
                 WIDTH - RIGHT - 18.0,
                 y,
-                escape(name)
+                escaped(name)
             );
         }
     }
 
-    fn finish(mut self) -> String {
+    fn finish(mut self) -> Markup {
         self.svg.push_str("</svg>");
-        self.svg
+        PreEscaped(self.svg)
     }
 }
 
@@ -311,7 +324,8 @@ mod tests {
             points: vec![(0.0, 0.0), (10.0, 100.0)],
             dots: true,
         };
-        let (x_label, y_label) = ("k".into(), "%".into());
+        let x_label = "k".into();
+        let y_label = "%".into();
         let chart = LineChart {
             title: "t \"q\"".into(),
             x_label,
@@ -320,7 +334,7 @@ mod tests {
             y_range: (0.0, 100.0),
             series: vec![series],
         };
-        let svg = chart.render();
+        let svg = chart.render().into_string();
         assert!(svg.contains("points=\"52.0,254.0 446.0,16.0\""), "{svg}");
         assert!(
             svg.contains("&lt;x&gt;") && svg.contains("t &quot;q&quot;") && !svg.contains("NaN")
@@ -339,7 +353,8 @@ mod tests {
             series,
             bins: 2,
         }
-        .render();
+        .render()
+        .into_string();
         assert_eq!(svg.matches("<rect class=\"bar a\"").count(), 2);
         assert!(
             svg.contains("<title>0 to 5: 1</title>") && svg.contains("<title>5 to 10: 3</title>"),

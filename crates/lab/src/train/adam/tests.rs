@@ -66,11 +66,9 @@ fn loss_gradient_and_steps_are_those_of_pytorch() {
                 .unwrap();
             normalise_rows(&projected).unwrap()
         };
-        let (query, positive, negative) = (
-            embed(&fixture.query),
-            embed(&fixture.positive),
-            embed(&fixture.negative),
-        );
+        let query = embed(&fixture.query);
+        let positive = embed(&fixture.positive);
+        let negative = embed(&fixture.negative);
         let loss = triplet_margin_loss(&query, &positive, &negative, fixture.margin).unwrap();
         assert!((loss.to_scalar::<f32>().unwrap() - step.loss).abs() < 1e-6);
         let gradients = loss.backward().unwrap();

@@ -3,9 +3,10 @@
 
 use super::*;
 use crate::synth::{Condition, StreetWorld, Viewpoint};
+use crate::train::Schedule;
+use crate::train::interruption::InterruptAfter;
 use crate::train::loss::triplet_margin_loss;
 use crate::train::triplets::Side;
-use crate::train::{Progress, Schedule};
 use placeformer_core::types::ImageSize;
 use placeformer_vision::extract::{
     BlockWeights, CandleEncoder, Encoder, Geometry, Linear, Norm, Preset,
@@ -88,7 +89,8 @@ fn model(trainable: TrainableBlocks, token_norm: bool) -> BackboneModel {
         random(&mut rng, GLOBAL_DIM * GEOMETRY.dim),
         random(&mut rng, GLOBAL_DIM),
     );
-    let (images, augmentation) = (ImageConfig::default(), Augmentation::NONE);
+    let images = ImageConfig::default();
+    let augmentation = Augmentation::NONE;
     BackboneModel::new(
         weights(),
         spec(token_norm),
@@ -113,7 +115,8 @@ fn images(count: usize) -> Vec<ImageTensor> {
 #[test]
 fn tokens_are_those_of_the_encoder_that_serves() {
     for token_norm in [false, true] {
-        let (model, images) = (model(TrainableBlocks::All, token_norm), images(3));
+        let model = model(TrainableBlocks::All, token_norm);
+        let images = images(3);
         let trained = model.tokens(&images).unwrap();
         let served = CandleEncoder::new(&weights(), &spec(token_norm))
             .unwrap()
@@ -151,7 +154,8 @@ fn loss(model: &BackboneModel, images: &[ImageTensor]) -> Tensor {
 
 #[test]
 fn gradients_of_every_kind_of_weight_agree_with_finite_differences() {
-    let (model, images) = (model(TrainableBlocks::All, true), images(2));
+    let model = model(TrainableBlocks::All, true);
+    let images = images(2);
     let gradients = loss(&model, &images).backward().unwrap();
     let names = [
         "patch_embed.proj.weight",
@@ -187,7 +191,8 @@ fn gradients_of_every_kind_of_weight_agree_with_finite_differences() {
         let step = 4e-3f32;
         let numeric = (value_at(step) - value_at(-step)) / f64::from(2.0 * step);
         variable.set(&start).unwrap();
-        let (analytic, tolerance) = (f64::from(analytic[at]), 0.02 * numeric.abs() + 1e-2);
+        let analytic = f64::from(analytic[at]);
+        let tolerance = 0.02 * numeric.abs() + 1e-2;
         assert!(
             (numeric - analytic).abs() < tolerance,
             "{name}[{at}]: {numeric} against {analytic}"
@@ -218,10 +223,8 @@ fn only_the_blocks_asked_for_move() {
     );
     // Without a norm behind the exit block its weights have no gradient, and are left alone.
     assert!(!all.iter().any(|name| name.starts_with("norm.")));
-    let (head, images) = (
-        (vec![0.0; GLOBAL_DIM * 8], vec![0.0; GLOBAL_DIM]),
-        ImageConfig::default(),
-    );
+    let head = (vec![0.0; GLOBAL_DIM * 8], vec![0.0; GLOBAL_DIM]);
+    let images = ImageConfig::default();
     let trainable = TrainableBlocks::Last(3);
     let made = BackboneModel::new(
         weights(),
@@ -322,16 +325,11 @@ fn train_in(
         augmentation: config.augmentation,
         ..model(TrainableBlocks::Last(1), false)
     };
-    let mut progress = |progress: Progress<'_>| match progress {
-        Progress::Cycle(record) if record.step >= stop_after => {
-            std::panic::panic_any("interrupted")
-        }
-        _ => {}
-    };
+    let interrupt = InterruptAfter(stop_after);
     let session = Session {
         folder: folder.to_owned(),
         identity: "drawn".into(),
-        progress: &mut progress,
+        progress: &interrupt,
     };
     let run = std::panic::AssertUnwindSafe(|| model.train(set, set, config, session).unwrap());
     let outcome = std::panic::catch_unwind(run).ok()?;
@@ -369,7 +367,8 @@ fn an_interrupted_run_of_blocks_continues_bit_for_bit() {
         augmentation: Augmentation::default(),
         ..config(60)
     };
-    let (whole, broken) = (folder.path().join("whole"), folder.path().join("broken"));
+    let whole = folder.path().join("whole");
+    let broken = folder.path().join("broken");
     let (straight, expected) = train_in(&whole, &set, &config, u64::MAX).unwrap();
     assert!(train_in(&broken, &set, &config, 40).is_none());
     let (continued, outcome) = train_in(&broken, &set, &config, u64::MAX).unwrap();

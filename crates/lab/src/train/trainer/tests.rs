@@ -2,7 +2,16 @@
 
 use super::*;
 use crate::train::head::{HeadModel, PooledTokens};
+use crate::train::interruption::InterruptAfter;
+use crate::train::mining::draw_pool;
+use crate::train::model::Sample;
 use crate::train::{Augmentation, Schedule};
+use candle_core::{Tensor, Var};
+use placeformer_core::progress::{Silent, Step};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::ops::Range;
+use std::sync::Mutex;
 
 const DIM: usize = 16;
 
@@ -64,16 +73,11 @@ fn train_in(
     stop_after: u64,
 ) -> Option<Outcome> {
     let validation = set.clone();
-    let mut progress = |progress: Progress<'_>| match progress {
-        Progress::Cycle(record) if record.step >= stop_after => {
-            std::panic::panic_any("interrupted")
-        }
-        _ => {}
-    };
+    let interrupt = InterruptAfter(stop_after);
     let session = Session {
         folder: folder.to_owned(),
         identity: "test".into(),
-        progress: &mut progress,
+        progress: &interrupt,
     };
     let run =
         std::panic::AssertUnwindSafe(|| model.train(set, &validation, config, session).unwrap());
@@ -96,7 +100,8 @@ fn eight_places_are_learnt_to_zero_loss() {
 #[test]
 fn an_interrupted_run_continues_bit_for_bit() {
     let (set, tokens) = eight_places();
-    let (whole, broken) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let whole = tempfile::tempdir().unwrap();
+    let broken = tempfile::tempdir().unwrap();
     let config = config(100);
     let straight = head(&tokens);
     let expected = train_in(whole.path(), &straight, &set, &config, u64::MAX).unwrap();
@@ -120,13 +125,12 @@ fn a_checkpoint_of_other_settings_or_a_broken_one_is_refused() {
     let (set, tokens) = eight_places();
     let folder = tempfile::tempdir().unwrap();
     train_in(folder.path(), &head(&tokens), &set, &config(40), u64::MAX).unwrap();
-    let mut progress = |_: Progress<'_>| {};
     let validation = set.clone();
-    let mut attempt = |config: &TrainConfig, identity: &str| {
+    let attempt = |config: &TrainConfig, identity: &str| {
         let session = Session {
             folder: folder.path().to_owned(),
             identity: identity.into(),
-            progress: &mut progress,
+            progress: &Silent,
         };
         head(&tokens)
             .train(&set, &validation, config, session)
@@ -152,6 +156,25 @@ fn training_stops_when_validation_no_longer_improves() {
         outcome.stopped_early && outcome.steps < 2_000,
         "{outcome:?}"
     );
+}
+
+/// Remembers the steps of the run, and how many images the mining was to embed.
+#[derive(Default)]
+struct Recorder {
+    steps: Mutex<Vec<u64>>,
+    mined: Mutex<Option<usize>>,
+}
+
+impl Progress for Recorder {
+    fn update(&self, step: Step<'_>) {
+        match step.task {
+            "training" => self.steps.lock().unwrap().push(step.done),
+            "mining" => *self.mined.lock().unwrap() = step.total.map(|total| total as usize),
+            other => panic!("{other}"),
+        }
+    }
+
+    fn end(&self, _task: &str) {}
 }
 
 /// Gives every image the same descriptor, and counts the images it is asked for.
@@ -193,7 +216,7 @@ impl TripletModel for Counting {
 fn a_collapsed_model_finds_nothing() {
     let (set, _) = eight_places();
     for value in [0.5, f32::NAN] {
-        let recall = validate(&Counting::new(value), &set, &mut |_| {}).unwrap();
+        let recall = validate(&Counting::new(value), &set, &Silent).unwrap();
         // 21 images tie with the positives, so not even ten answers reach one.
         assert_eq!(
             recall,
@@ -236,7 +259,8 @@ fn a_cycle_costs_its_queries_their_positives_and_the_pool_however_large_the_data
             .map(|i| PathBuf::from(format!("{side}{i}")))
             .collect()
     };
-    let (asking, answering) = (3000usize, 9000usize);
+    let asking = 3000usize;
+    let answering = 9000usize;
     let positives: Vec<Vec<u32>> = (0..asking as u32)
         .map(|query| vec![3 * query, 3 * query + 1])
         .collect();
@@ -255,28 +279,25 @@ fn a_cycle_costs_its_queries_their_positives_and_the_pool_however_large_the_data
     let model = Counting::new(1.0);
     let mut adam = Adam::new(model.variables()).unwrap();
     let usable: Vec<usize> = set.usable().collect();
-    let (mut steps, mut announced) = (Vec::new(), 0);
-    let mut progress = |progress: Progress<'_>| match progress {
-        Progress::Step { steps: step, .. } => steps.push(step),
-        Progress::Described {
-            purpose: "mining",
-            of,
-            ..
-        } => announced = of,
-        _ => panic!("{progress:?}"),
-    };
+    let recorder = Recorder::default();
+    let steps = Task::begin(&recorder, "training", 1000);
+    steps.set_done(40);
     let cycle = Cycle {
         model: &model,
         set: &set,
         config: &config,
+        progress: &recorder,
+        steps: &steps,
     };
-    let loss = cycle
-        .run(&usable, &mut adam, 40..45, &mut progress)
-        .unwrap();
+    let loss = cycle.run(&usable, &mut adam, 40..45).unwrap();
+    let mut shown = recorder.steps.lock().unwrap().clone();
+    shown.dedup();
+    let announced = recorder.mined.lock().unwrap().unwrap();
     // All descriptors coincide, so every triplet costs the margin.
     assert!((f64::from(loss) - config.margin).abs() < 1e-6, "{loss}");
-    assert_eq!(steps, [41, 42, 43, 44, 45]);
-    let (asked, trained) = (5 * 4, 5 * 3 * 4);
+    assert_eq!(shown, [0, 40, 41, 42, 43, 44, 45]);
+    let asked = 5 * 4;
+    let trained = 5 * 3 * 4;
     let described = model.described.borrow().len();
     assert_eq!(described, announced + trained);
     assert!(
@@ -304,6 +325,8 @@ fn queries_without_a_negative_in_the_pool_are_not_asked() {
         model: &model,
         set: &set,
         config: &config(20),
+        progress: &Silent,
+        steps: &Task::begin(&Silent, "training", 20),
     };
     let usable: Vec<usize> = set.usable().collect();
     // Images 0 to 2 are near to each other, so only the other places can be asked against them.

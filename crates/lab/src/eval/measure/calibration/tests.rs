@@ -1,5 +1,8 @@
 //! Fits on planted truths, folds, thresholds by hand.
 
+use super::super::answers::Prediction;
+use super::super::cross_validation::Unseen;
+use super::super::threshold::{trusted, wilson};
 use super::*;
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
@@ -28,10 +31,8 @@ fn drawn(truth: &ConfidenceWeights, count: usize, seed: u64) -> Vec<TopOne> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     (0..count)
         .map(|query| {
-            let (spatial_score, distance) = (
-                random.random_range(0.0..120.0),
-                random.random_range(0.0..1.5),
-            );
+            let spatial_score = random.random_range(0.0..120.0);
+            let distance = random.random_range(0.0..1.5);
             let correct = random.random::<f64>() < truth.confidence(Some(spatial_score), distance);
             answer(query, spatial_score, distance, correct)
         })
@@ -256,7 +257,8 @@ fn neighbouring_frames_no_longer_vouch_for_each_other() {
     let mut random = ChaCha8Rng::seed_from_u64(2);
     let answers: Vec<TopOne> = (0..40)
         .flat_map(|place| {
-            let (score, correct) = (random.random_range(0.0..100.0), random.random::<bool>());
+            let score = random.random_range(0.0..100.0);
+            let correct = random.random::<bool>();
             (0..10).map(move |_| answer(place, score, 0.5, correct))
         })
         .collect();

@@ -2,7 +2,10 @@
 
 use super::*;
 use crate::datasets::Item;
-use crate::eval::run::{Candidate, Neighbour};
+use crate::eval::run::{Candidate, Neighbour, QuerySeconds};
+use maud::html;
+use placeformer_core::types::ModelId;
+use placeformer_vision::extract::ExtractConfig;
 use placeformer_vision::rerank::PairScore;
 
 fn answer(query: usize, global: &[usize], reranked: &[(usize, u32)]) -> Answer {
@@ -74,13 +77,14 @@ fn a_run_by_hand() {
         load: 0.2,
         rerank: 0.3,
     };
-    let asked = Asked {
-        answers: &answers,
-        left_out: &[],
+    let mut asked = DatasetAnswers {
+        answers: answers.to_vec(),
+        left_out: Vec::new(),
         seconds,
     };
-    let (database, queries) = (features(3, 2.0), features(4, 9.0));
-    let summary = summarise(&dataset, &database, &queries, asked, config.clone(), None).unwrap();
+    let database = features(3, 2.0);
+    let queries = features(4, 9.0);
+    let summary = summarise(&dataset, &database, &queries, &asked, config.clone(), None);
     assert_eq!(
         (
             summary.queries,
@@ -124,7 +128,7 @@ fn a_run_by_hand() {
         text.contains("hand: 4 queries (2 with a match, 1 without) against 3 references"),
         "{text}"
     );
-    let page = crate::eval::report::html(&summary, &dataset, &answers, &[], "");
+    let page = crate::eval::report::html(&summary, &dataset, &asked, &html! {});
     assert_eq!(page.matches("<svg").count(), 3);
     assert!(!page.contains("NaN") && !page.contains("src=\"http"));
     assert!(summary.given_calibration.is_none() && !page.contains("the one given"));
@@ -132,12 +136,9 @@ fn a_run_by_hand() {
     // Asked again without its place, the first query still gets 30 inliers: nothing surer than 40
     // is wrong.
     let left_out = [answer(0, &[0, 2], &[(0, 30)]), answer(1, &[1], &[(1, 50)])];
-    let asked = Asked {
-        left_out: &left_out,
-        ..asked
-    };
+    asked.left_out = left_out.to_vec();
     let given = calibration();
-    let again = summarise(&dataset, &database, &queries, asked, config, Some(&given)).unwrap();
+    let again = summarise(&dataset, &database, &queries, &asked, config, Some(&given));
     assert_eq!(
         (&again.recall.reranked, again.queries_left_out),
         (&summary.recall.reranked, 2)
@@ -160,7 +161,7 @@ fn a_run_by_hand() {
         "{applied:?}"
     );
     assert!(crate::eval::report::text(&again).contains("of the calibration given"));
-    let page = crate::eval::report::html(&again, &dataset, &answers, &left_out, "");
+    let page = crate::eval::report::html(&again, &dataset, &asked, &html! {});
     assert!(page.contains("the one given") && page.contains("no match exists"));
 }
 
