@@ -43,7 +43,7 @@ mod tests {
             .build()
             .unwrap();
         runtime.block_on(async {
-            let (release, released) = mpsc::channel::<()>();
+            let (release, released) = mpsc::sync_channel::<()>(1);
             let (started, has_started) = oneshot::channel();
             let occupying = tokio::spawn(blocking(move || {
                 started.send(()).unwrap();
@@ -51,7 +51,7 @@ mod tests {
             }));
             has_started.await.unwrap();
 
-            let (begun, has_begun) = mpsc::channel();
+            let (begun, has_begun) = mpsc::sync_channel(1);
             let waiting = tokio::spawn(blocking(move || begun.send(())));
             tokio::task::yield_now().await;
             waiting.abort();
