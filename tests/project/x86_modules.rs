@@ -1,7 +1,7 @@
-//! Keeps x86 code in modules that other architectures do not compile.
+//! Keeps the x86 code of the kernels in modules that other architectures do not compile.
 //!
 //! Vector code exists for x86-64 only. That the crate builds and works elsewhere must not depend on
-//! somebody trying it, so this test reads the crate's sources. Intrinsics, assembly and target
+//! somebody trying it, so this test reads the sources of `crates/kernels`. Intrinsics, assembly and target
 //! features may occur only in files named after an instruction set, and every declaration or import
 //! of such a module must be compiled for x86-64 only.
 
@@ -79,7 +79,7 @@ fn modules_for_x86_are_compiled_for_x86_only() {
 /// Every source file of the crate with its path.
 fn sources() -> Vec<(PathBuf, String)> {
     let mut sources = Vec::new();
-    let mut folders = vec![Path::new(env!("CARGO_MANIFEST_DIR")).join("src")];
+    let mut folders = vec![Path::new(env!("CARGO_MANIFEST_DIR")).join("crates/kernels/src")];
     while let Some(folder) = folders.pop() {
         for entry in std::fs::read_dir(folder).unwrap() {
             let path = entry.unwrap().path();
