@@ -216,8 +216,9 @@ fn for_each_vector<I: VectorIsa>(
                 isa.load(&offsets[column..]),
             )
         });
-        for row in 0..product.rows {
-            let sum = isa.load(&product.block[row * columns + column..]);
+        let lines = product.block.chunks_exact(columns).take(product.rows);
+        for (row, line) in lines.enumerate() {
+            let sum = isa.load(&line[column..]);
             let value = match codes {
                 None => sum.add(bias),
                 Some((factor, offset)) => {

@@ -45,8 +45,11 @@ fn multiply_tile<D: DotIsa, const ROWS: usize, const VECTORS: usize>(
 
     for (start, segment) in job.segments() {
         let count = segment.len() / width;
-        let rows: [&[u32]; ROWS] =
-            std::array::from_fn(|row| &left[row * left_stride + start..][..count]);
+        // Slices of a length that the compiler sees is `count`: checks vanish from the loop below.
+        let mut rows: [&[u32]; ROWS] = [&[]; ROWS];
+        for row in 0..ROWS {
+            rows[row] = &left[row * left_stride + start..][..count];
+        }
         for (at, line) in segment.chunks_exact(width).enumerate().take(count) {
             let mut columns = [isa.zero(); VECTORS];
             for vector in 0..VECTORS {
