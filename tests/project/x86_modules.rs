@@ -56,8 +56,7 @@ fn modules_for_x86_are_compiled_for_x86_only() {
         for (index, &(number, line)) in lines.iter().enumerate() {
             let item = line.trim();
             let names_module = X86_MODULES.iter().any(|module| has_word(item, module));
-            let is_declaration = has_word(item, "mod") || has_word(item, "use");
-            if !names_module || !is_declaration {
+            if !names_module || !is_declaration(item) {
                 continue;
             }
             declarations += 1;
@@ -106,6 +105,16 @@ fn code_lines(source: &str) -> impl Iterator<Item = (usize, &str)> {
     lines
         .map(|(index, line)| (index + 1, line.split("//").next().unwrap()))
         .filter(|(_, line)| !line.trim().is_empty())
+}
+
+/// Whether a line declares a module or imports something, whatever its visibility.
+fn is_declaration(line: &str) -> bool {
+    let item = match line.strip_prefix("pub(") {
+        Some(restricted) => restricted.split_once(')').unwrap().1,
+        None => line.strip_prefix("pub ").unwrap_or(line),
+    };
+    let item = item.trim_start();
+    item.starts_with("mod ") || item.starts_with("use ")
 }
 
 /// Whether `text` contains `word` with no letter, digit or underscore next to it.

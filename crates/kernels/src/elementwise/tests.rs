@@ -126,3 +126,14 @@ proptest! {
         prop_assert!((expected.1.iter().sum::<f32>() - 1.0).abs() < 1e-4);
     }
 }
+
+#[test]
+#[should_panic(expected = "rows of the result overlap")]
+fn rows_across_each_other_are_refused() {
+    let columns = Tiling::of(Simd::SCALAR).columns;
+    let block = vec![0.0; 2 * columns];
+    let bias = vec![0.0; columns];
+    let product = check::plain(2, &block, &bias);
+    let mut out = vec![0.0; 2 * columns];
+    finish_block(Simd::SCALAR, Epilogue::Bias, product, &mut out, columns - 1);
+}

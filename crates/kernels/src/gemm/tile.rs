@@ -43,17 +43,29 @@ fn multiply_tile<D: DotIsa, const ROWS: usize, const VECTORS: usize>(
         }
     }
 
-    for (start, segment) in job.segments() {
+    // What is left of each row.
+    let mut rows: [&[u32]; ROWS] = [&[]; ROWS];
+    for row in 0..ROWS {
+        rows[row] = &left[row * left_stride..];
+    }
+
+    for (_, segment) in job.segments() {
         let count = segment.len() / width;
-        let rows: [&[u32]; ROWS] =
-            std::array::from_fn(|row| &left[row * left_stride + start..][..count]);
+        // The compiler sees that these slices are `count` long, so that the loop below needs no
+        // bounds checks.
+        let mut words: [&[u32]; ROWS] = [&[]; ROWS];
+        for row in 0..ROWS {
+            let (of_segment, rest) = rows[row].split_at(count);
+            words[row] = of_segment;
+            rows[row] = rest;
+        }
         for (at, line) in segment.chunks_exact(width).enumerate().take(count) {
             let mut columns = [isa.zero(); VECTORS];
             for vector in 0..VECTORS {
                 columns[vector] = isa.load(&line[vector * D::COUNT..]);
             }
             for row in 0..ROWS {
-                let word = isa.broadcast(rows[row][at]);
+                let word = isa.broadcast(words[row][at]);
                 for vector in 0..VECTORS {
                     sums[row][vector] = isa.add_products(sums[row][vector], word, columns[vector]);
                 }

@@ -66,35 +66,42 @@ pub(super) fn round_rows<I: Bf16Isa>(isa: I, rows: SourceRows<'_>, packed: &mut 
 
 /// See [`super::quantise_rows`].
 #[inline(always)]
-pub(super) fn quantise_rows<I: VectorIsa>(
+pub(super) fn quantise_rows<'a, I: VectorIsa>(
     isa: I,
-    rows: SourceRows<'_>,
+    rows: SourceRows<'a>,
     scaling: ChannelScaling<'_>,
     packed: &mut [u32],
     stride: usize,
     factors: &mut [f32],
 ) {
     let ChannelScaling { gain, shift } = scaling;
+    let count = I::Floats::COUNT;
     if gain.is_empty() {
-        quantise_mapped(isa, rows, |_, value| value, packed, stride, factors);
+        let vectors = |row: &'a [f32]| row.chunks_exact(count).map(|values| isa.load(values));
+        quantise_vectors(isa, rows, vectors, packed, stride, factors);
         return;
     }
-    // Not fused, since the portable code rounds twice: the codes are the same everywhere.
-    let scaled = |column: usize, value: I::Floats| {
-        value
-            .mul(isa.load(&gain[column..]))
-            .add(isa.load(&shift[column..]))
+    let vectors = |row: &'a [f32]| {
+        let gains = gain.chunks_exact(count);
+        let shifts = shift.chunks_exact(count);
+        let values = row.chunks_exact(count);
+        // Not fused, since the portable code rounds twice: the codes are the same everywhere.
+        values
+            .zip(gains.zip(shifts))
+            .map(|(values, (gain, shift))| {
+                let value = isa.load(values);
+                value.mul(isa.load(gain)).add(isa.load(shift))
+            })
     };
-    quantise_mapped(isa, rows, scaled, packed, stride, factors);
+    quantise_vectors(isa, rows, vectors, packed, stride, factors);
 }
 
-/// Quantises the rows after `map`, which receives the column of a vector's first element and the
-/// vector.
+/// Quantises the rows; `vectors_of` gives the vectors of a row after scaling.
 #[inline(always)]
-fn quantise_mapped<I: VectorIsa>(
+fn quantise_vectors<'a, I: VectorIsa, V: Iterator<Item = I::Floats>>(
     isa: I,
-    rows: SourceRows<'_>,
-    map: impl Fn(usize, I::Floats) -> I::Floats,
+    rows: SourceRows<'a>,
+    vectors_of: impl Fn(&'a [f32]) -> V,
     packed: &mut [u32],
     stride: usize,
     factors: &mut [f32],
@@ -103,8 +110,7 @@ fn quantise_mapped<I: VectorIsa>(
     for (index, factor) in factors.iter_mut().enumerate() {
         let row = rows.row(index);
         let mut highest = isa.splat(0.0);
-        for (number, values) in row.chunks_exact(count).enumerate() {
-            let value = map(number * count, isa.load(values));
+        for value in vectors_of(row) {
             let magnitude = value.max(isa.splat(0.0).sub(value));
             highest = highest.max(magnitude);
         }
@@ -114,10 +120,8 @@ fn quantise_mapped<I: VectorIsa>(
         let scale = isa.splat(127.0 / largest);
         let zero_code = isa.splat(128.0);
         let codes: &mut [u8] = bytemuck::cast_slice_mut(&mut packed[index * stride..]);
-        let vectors = row.chunks_exact(count).zip(codes.chunks_exact_mut(count));
-        for (number, (values, codes)) in vectors.enumerate() {
+        for (value, codes) in vectors_of(row).zip(codes.chunks_exact_mut(count)) {
             // Not fused, as above.
-            let value = map(number * count, isa.load(values));
             value.mul(scale).add(zero_code).store_u8(codes);
         }
         *factor = largest / 127.0;
