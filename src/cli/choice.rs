@@ -24,7 +24,9 @@ mod tests {
     fn every_name_is_accepted_shown_and_told_from_others() {
         let argument = Arg::new("kind").value_parser(choice::<DatasetKind>());
         let mut command = Command::new("test").arg(argument);
+        // Long descriptions are wrapped to the width of the terminal.
         let help = command.render_long_help().to_string();
+        let help = help.split_whitespace().collect::<Vec<_>>().join(" ");
         for kind in DatasetKind::ALL {
             let parsed = command
                 .try_get_matches_from_mut(["test", kind.as_str()])
