@@ -109,12 +109,7 @@ fn paint_shutters(
 }
 
 /// The glass, what stands behind it, and a reflection.
-fn paint_glass(
-    front: &mut Painting,
-    [x, y]: [f32; 2],
-    [width, height]: [f32; 2],
-    dice: &mut Dice,
-) {
+fn paint_glass(front: &mut Painting, [x, y]: [f32; 2], [width, height]: [f32; 2], dice: &mut Dice) {
     let sky = dice.vary([120, 142, 164], 14.0);
     front.gradient(x, y, width, height, sky, dice.vary([46, 52, 60], 8.0));
     // What stands behind the glass: blinds, curtains, or nothing.
