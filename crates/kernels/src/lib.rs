@@ -44,7 +44,7 @@
 //!
 //! # How results are kept right
 //!
-//! `check.rs` in each folder compares a level with the portable version, and [`self_check`] runs
+//! `check.rs` in each folder compares a level with the portable version, and [`self_check()`] runs
 //! all of them on the machine at hand before the program computes anything. Property tests do the
 //! same over many sizes. Integers agree exactly everywhere; for floats each kernel tells whether
 //! its bits are the same at every level.

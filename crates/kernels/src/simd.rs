@@ -192,7 +192,7 @@ static SELECTED: OnceLock<Result<Simd, SimdError>> = OnceLock::new();
 ///
 /// # Errors
 /// The variable names no level, or one that the CPU lacks. Programs call this at start, through
-/// [`self_check`](super::self_check), and stop on an error.
+/// [`self_check`](super::self_check()), and stop on an error.
 pub fn try_selected() -> Result<Simd, SimdError> {
     let read = || {
         let value = std::env::var_os(SIMD_VARIABLE);
