@@ -91,6 +91,9 @@ class Stack:
             PROMETHEUS_PORT=str(self.prometheus_port),
             PROXY_PORT=str(self.proxy_port),
             MODEL_CACHE=str(self.cache),
+            # A development build on a slow machine takes seconds a query. What is tested is that
+            # replicas are replaced, not how many queries they can take.
+            PLACEFORMER_MAX_WAIT_MS="60000",
             COMPOSE_PROJECT_NAME=self.project,
         )
 
