@@ -1,5 +1,6 @@
 //! `load`, `verify` and `bench` as commands: the real binary, its report, and how it fails.
 
+use crate::common::program::offline;
 use crate::common::{places, service as support};
 use placeformer::http::serve;
 use placeformer_core::types::ReferenceId;
@@ -10,7 +11,7 @@ use std::future::pending;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Output;
 use support::{App, picture};
 use tempfile::TempDir;
 use tokio::net::TcpListener;
@@ -18,18 +19,7 @@ use tokio::runtime::Runtime;
 
 /// Runs the binary in `folder`, where it finds no model, no network and no settings but its own.
 fn placeformer(folder: &Path, arguments: &[&str]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_placeformer"));
-    for (name, _) in std::env::vars_os() {
-        if name.to_string_lossy().starts_with("PLACEFORMER_") {
-            command.env_remove(name);
-        }
-    }
-    command
-        .args(arguments)
-        .env("PLACEFORMER_CACHE", folder.join("cache"))
-        .env("HF_ENDPOINT", "http://127.0.0.1:9")
-        .env("PATH", "")
-        .current_dir(folder);
+    let mut command = offline(folder, arguments);
     command.output().expect("the binary was built")
 }
 
@@ -398,48 +388,18 @@ mod load {
     }
 }
 
-#[cfg(feature = "lab")]
 mod bench {
     use super::*;
-    use placeformer_vision::extract::{BlockWeights, Linear, Norm, Preset, VitWeights};
+    use crate::common::weights::made_up;
+    use placeformer_vision::extract::Preset;
 
     /// The row that runs no transformer, so that the weights' values do not matter.
     const ROW: &str = "decode_resize_1080p";
 
-    /// Saves weights of the paper's geometry, all zero, in `folder`.
+    /// Saves weights of the paper's geometry in `folder`.
     fn save_weights(folder: &Path) {
         let preset = Preset::PlaceformerVits16;
-        let geometry = preset.geometry();
-        let dim = geometry.dim;
-        let linear = |from: usize, to: usize| Linear {
-            weight: vec![0.0; from * to],
-            bias: vec![0.0; to],
-        };
-        let norm = || Norm {
-            weight: vec![0.0; dim],
-            bias: vec![0.0; dim],
-        };
-        let block = || BlockWeights {
-            norm1: norm(),
-            qkv: linear(dim, 3 * dim),
-            proj: linear(dim, dim),
-            layer_scale1: None,
-            norm2: norm(),
-            fc1: linear(dim, geometry.mlp_dim),
-            fc2: linear(geometry.mlp_dim, dim),
-            layer_scale2: None,
-        };
-        let weights = VitWeights {
-            preset,
-            geometry,
-            position_grid: (14, 14),
-            patch_embed: linear(3 * geometry.patch * geometry.patch, dim),
-            cls_token: vec![0.0; dim],
-            positions: vec![0.0; (1 + 14 * 14) * dim],
-            blocks: (0..geometry.depth).map(|_| block()).collect(),
-            norm: norm(),
-            unused_parameters: 0,
-        };
+        let weights = made_up(preset, preset.geometry(), (14, 14), 7);
         weights.save(&folder.join("weights.safetensors")).unwrap();
     }
 
