@@ -93,7 +93,7 @@ class Stack:
             MODEL_CACHE=str(self.cache),
             # A development build on a slow machine takes seconds a query. What is tested is that
             # replicas are replaced, not how many queries they can take.
-            PLACEFORMER_MAX_WAIT_MS="60000",
+            PLACEFORMER_PIPELINE__MAX_WAIT_MS="60000",
             COMPOSE_PROJECT_NAME=self.project,
         )
 
