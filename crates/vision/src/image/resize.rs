@@ -3,8 +3,9 @@
 
 use super::error::ImageError;
 use super::rgb::RgbImage;
-use fast_image_resize::images::{Image, ImageRef};
-use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
+use fast_image_resize::images::{TypedImage, TypedImageRef};
+use fast_image_resize::pixels::U8x3;
+use fast_image_resize::{FilterType, ResizeAlg, ResizeOptions, Resizer};
 use placeformer_core::types::{ImageSize, ImageTensor};
 
 /// ImageNet mean of R, G, B.
@@ -35,17 +36,18 @@ pub(super) fn resize(image: &RgbImage, size: ImageSize) -> Result<RgbImage, Imag
         return Ok(image.clone());
     }
     let ImageSize { width, height } = image.size;
-    let source = ImageRef::new(width, height, &image.pixels, PixelType::U8x3)
+    let empty = |_| ImageError::EmptyTarget(size);
+    // The resizer's untyped images would have the compiler make every loop for each of its twelve
+    // types of pixels, which took longer than the rest of this crate.
+    let source = TypedImageRef::<U8x3>::from_buffer(width, height, &image.pixels).map_err(empty)?;
+    let mut pixels = vec![0; size.width as usize * size.height as usize * 3];
+    let mut small = TypedImage::<U8x3>::from_buffer(size.width, size.height, &mut pixels)
         .map_err(|_| ImageError::EmptyTarget(size))?;
-    let mut small = Image::new(size.width, size.height, PixelType::U8x3);
     let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Bilinear));
     Resizer::new()
-        .resize(&source, &mut small, &options)
+        .resize_typed(&source, &mut small, &options)
         .map_err(|_| ImageError::EmptyTarget(size))?;
-    Ok(RgbImage {
-        size,
-        pixels: small.into_vec(),
-    })
+    Ok(RgbImage { size, pixels })
 }
 
 /// Bytes `[height, width, 3]` to floats `[3, height, width]`: `(value / 255 - mean) / deviation`.
