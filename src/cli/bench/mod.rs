@@ -23,7 +23,7 @@ use std::sync::Arc;
 #[derive(Debug, clap::Args)]
 pub struct BenchArgs {
     /// Rows to measure, such as extract,search_1m; all but search_10m (14 GB) unless given.
-    #[arg(long, value_name = "NAME,..", value_delimiter = ',')]
+    #[arg(long, value_name = "NAME", value_delimiter = ',', num_args = 1..)]
     only: Vec<String>,
     /// Paired runs of the slow rows; quick ones take more.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..))]
@@ -38,6 +38,7 @@ pub struct BenchArgs {
     #[arg(
         long,
         value_delimiter = ',',
+        num_args = 1..,
         default_values_t = [1_000, 100_000, 1_000_000],
         requires = "end_to_end"
     )]
@@ -46,7 +47,13 @@ pub struct BenchArgs {
     #[arg(long, default_value_t = 1_000, requires = "end_to_end")]
     drawn: u64,
     /// Clients that ask one query after the other, with --end-to-end.
-    #[arg(long, value_delimiter = ',', default_values_t = [1, 8], requires = "end_to_end")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        num_args = 1..,
+        default_values_t = [1, 8],
+        requires = "end_to_end"
+    )]
     clients: Vec<usize>,
     /// Seconds of each measurement, with --end-to-end.
     #[arg(long, default_value_t = 20.0, requires = "end_to_end")]
@@ -202,6 +209,27 @@ impl Drop for TemporaryFolder {
     fn drop(&mut self) {
         if let Err(error) = std::fs::remove_dir_all(&self.0) {
             eprintln!("warning: {} is left behind: {error}", self.0.display());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Arguments {
+        #[command(flatten)]
+        bench: BenchArgs,
+    }
+
+    #[test]
+    fn lists_are_separated_by_commas_or_by_spaces_as_the_help_prints_them() {
+        for numbers in [&["1000,100000"][..], &["1000", "100000"]] {
+            let line = [&["bench", "--end-to-end", "--references"], numbers].concat();
+            let parsed = Arguments::try_parse_from(line).unwrap_or_else(|error| panic!("{error}"));
+            assert_eq!(parsed.bench.references, [1000, 100_000]);
         }
     }
 }

@@ -86,7 +86,8 @@ pub(super) struct MethodArgs {
     #[arg(
         long,
         value_delimiter = ',',
-        value_name = "PRESET,...",
+        num_args = 1..,
+        value_name = "PRESET",
         requires = "ablate"
     )]
     pub(super) backbones: Vec<Preset>,
@@ -109,8 +110,9 @@ pub(super) struct RerankArgs {
     #[arg(
         long,
         value_delimiter = ',',
+        num_args = 1..,
         default_value = "1,1+2,2+3",
-        value_name = "SET,..."
+        value_name = "SET"
     )]
     pub(super) scales: Vec<ScaleSet>,
 }
