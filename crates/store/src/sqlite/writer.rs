@@ -210,7 +210,7 @@ impl Worker {
     fn commit(&mut self, jobs: Vec<Box<dyn Job>>) {
         // What follows may write to the directory even before a transaction begins.
         if let Err(error) = self.files.storage.check() {
-            return refuse(jobs, &error.to_string());
+            return refuse(jobs, &reason_of(error));
         }
         let mut admitted = self.admit(jobs);
         if admitted.is_empty() {
@@ -335,7 +335,7 @@ impl Worker {
         writing: &Writing<'_>,
         progress: Option<Progress>,
     ) -> Result<(), Failure> {
-        let unmarked = |error: StoreError| Failure::Unmarked(error.to_string());
+        let unmarked = |error| Failure::Unmarked(reason_of(error));
         writing.check().map_err(unmarked)?;
         if let (Some(mark), Some(progress)) = (&self.files.mark, progress) {
             mark.record(&CommitMark::now(progress)).map_err(unmarked)?;
@@ -418,6 +418,14 @@ impl Worker {
         if let Err(error) = folded {
             tracing::warn!(%error, "cannot fold the log into the database now");
         }
+    }
+}
+
+/// What is wrong with the storage.
+fn reason_of(error: StoreError) -> String {
+    match error {
+        StoreError::StorageLost { reason } => reason,
+        other => other.to_string(),
     }
 }
 
