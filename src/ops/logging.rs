@@ -95,7 +95,7 @@ pub fn init(config: &LogConfig) -> Result<FlushGuard, InvalidFilter> {
     let lines = tracing_subscriber::fmt()
         .with_env_filter(directives)
         .with_span_events(FmtSpan::NONE)
-        // What cannot be logged would be reported by `note!`, which blocks and panics.
+        // What cannot be logged would be reported by `eprintln!`, which blocks and panics.
         .log_internal_errors(false)
         .with_writer(queue());
     let outcome = match config.format {

@@ -124,6 +124,7 @@ impl SqliteStore {
             sync_directory(directory).map_err(directory::io("cannot sync directory", directory))?;
         }
         let mark = tail::attach(directory, &connection, needed)?;
+        tail::begin(&connection);
         purge::abandon_unfinished_heads(&connection)?;
         let quarantine = Quarantine::load(&connection)?;
         let storage = Arc::new(Storage::watch(directory)?);

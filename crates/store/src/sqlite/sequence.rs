@@ -62,6 +62,27 @@ pub(super) fn count_commit(connection: &Connection) -> rusqlite::Result<Option<P
     progress(connection)
 }
 
+/// Whether the database was closed when it had come as far as it has, so that nothing of it can lie
+/// in a log.
+pub(super) fn is_closed(connection: &Connection) -> rusqlite::Result<bool> {
+    let sql = "SELECT count(*) = 2 AND min(next) = max(next) AS closed
+               FROM sequence WHERE name IN ('commit', 'closed')";
+    connection.query_row(sql, [], |row| row.get("closed"))
+}
+
+/// Says in the database that it is open.
+pub(super) fn set_open(connection: &Connection) -> rusqlite::Result<()> {
+    let sql = "UPDATE sequence SET next = -1 WHERE name = 'closed'";
+    connection.execute(sql, []).map(drop)
+}
+
+/// Says in the database that it is closed as it is now.
+pub(super) fn set_closed(connection: &Connection) -> rusqlite::Result<()> {
+    let sql = "UPDATE sequence SET next = (SELECT next FROM sequence WHERE name = 'commit')
+               WHERE name = 'closed'";
+    connection.execute(sql, []).map(drop)
+}
+
 /// Goes on behind what was lost: no number that a lost commit took is taken again.
 pub(super) fn skip_to(
     connection: &Connection,

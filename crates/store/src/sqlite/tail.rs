@@ -5,7 +5,7 @@
 use super::directory::{DATABASE, io};
 use super::engine::{failed, open_reader};
 use super::mark::{CommitMark, Found, MARK, MarkFile};
-use super::sequence::{Progress, progress, skip_to};
+use super::sequence::{Progress, is_closed, progress, set_open, skip_to};
 use crate::config::StoreConfig;
 use crate::error::StoreError;
 use placeformer_core::files::with_suffix;
@@ -13,6 +13,9 @@ use rusqlite::Connection;
 use std::fs::File;
 use std::io::{ErrorKind, Read};
 use std::path::Path;
+
+/// What is being done when the engine fails.
+const READING: &str = "reading how far it has come";
 
 /// What to do about commits that are missing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -80,13 +83,18 @@ fn compare(directory: &Path, config: &StoreConfig, found: Found) -> Result<MarkN
     refuse_foreign_log(directory, header)?;
     let path = directory.join(DATABASE);
     match header {
-        Header::None => of_database(directory, None, found),
+        Header::None => of_database(directory, None, false, found),
         Header::WithLog => {
             let read = open_reader(&path, config).and_then(|connection| {
-                progress(&connection).map_err(failed("reading how far it has come"))
+                let reached = progress(&connection).map_err(failed(READING))?;
+                let is_closed = match reached {
+                    Some(_) => is_closed(&connection).map_err(failed(READING))?,
+                    None => false,
+                };
+                Ok((reached, is_closed))
             });
             match read {
-                Ok(reached) => of_database(directory, reached, found),
+                Ok((reached, is_closed)) => of_database(directory, reached, is_closed, found),
                 // One unreadable page must not keep the rest from being served.
                 Err(error @ StoreError::Damaged { .. }) => {
                     tracing::error!(%error, "nobody can say whether the newest commits are there");
@@ -120,14 +128,16 @@ fn unknown(found: Found) -> MarkNeeded {
 fn of_database(
     directory: &Path,
     reached: Option<Progress>,
+    is_closed: bool,
     found: Found,
 ) -> Result<MarkNeeded, StoreError> {
     let no_mark = |reason| StoreError::NoCommitMark {
         path: directory.join(MARK),
         reason,
     };
-    // Without any commit there is nothing that could be lost.
-    let is_fresh = reached.is_none_or(|reached| reached.commits == 0);
+    // Without any commit there is nothing that could be lost. A store that was closed is whole
+    // without its log, and its database alone may have been copied.
+    let is_fresh = is_closed || reached.is_none_or(|reached| reached.commits == 0);
     match found {
         Found::Nothing | Found::Unreadable if is_fresh => Ok(MarkNeeded::Made),
         Found::Nothing => Err(no_mark("is missing")),
@@ -188,16 +198,15 @@ pub(super) fn attach(
     connection: &Connection,
     needed: MarkNeeded,
 ) -> Result<Option<MarkFile>, StoreError> {
-    let context = "reading how far it has come";
     match needed {
         MarkNeeded::Kept => return MarkFile::open(directory).map(Some),
         MarkNeeded::Made => {}
         MarkNeeded::Raised {
             commits,
             references,
-        } => skip_to(connection, commits, references).map_err(failed(context))?,
+        } => skip_to(connection, commits, references).map_err(failed(READING))?,
     }
-    match progress(connection).map_err(failed(context)) {
+    match progress(connection).map_err(failed(READING)) {
         Ok(Some(reached)) => MarkFile::create(directory, &CommitMark::now(reached)).map(Some),
         Ok(None) => Ok(None),
         Err(error @ StoreError::Damaged { .. }) => {
@@ -205,6 +214,19 @@ pub(super) fn attach(
             Ok(None)
         }
         Err(error) => Err(error),
+    }
+}
+
+/// Says in the database itself, and not only in its log, that it is open: whoever finds it so
+/// knows that it may lack commits.
+pub(super) fn begin(connection: &Connection) {
+    let begun = set_open(connection).and_then(|()| {
+        let fold = "PRAGMA wal_checkpoint(TRUNCATE)";
+        connection.query_row(fold, [], |_| Ok(()))
+    });
+    if let Err(error) = begun {
+        // On a full disk, for instance. The mark still tells what is missing.
+        tracing::warn!(%error, "the database does not say that it is open");
     }
 }
 
@@ -241,9 +263,9 @@ pub(super) fn complaint(directory: &Path, connection: &Connection) -> Option<Str
     };
     let reached = match progress(connection) {
         Ok(reached) => reached,
-        Err(error) => return Some(failed("reading how far it has come")(error).to_string()),
+        Err(error) => return Some(failed(READING)(error).to_string()),
     };
-    of_database(directory, reached, found)
+    of_database(directory, reached, false, found)
         .err()
         .map(|error| error.to_string())
 }

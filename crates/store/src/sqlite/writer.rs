@@ -18,7 +18,7 @@ use super::job::{Effect, Job, Pending, job};
 use super::mark::{CommitMark, MarkFile};
 use super::purge;
 use super::reserve::Reserve;
-use super::sequence::{Progress, count_commit};
+use super::sequence::{Progress, count_commit, set_closed};
 use super::storage::{Storage, Writing};
 use crate::crash_points;
 use crate::error::StoreError;
@@ -161,6 +161,12 @@ impl Worker {
 
     /// Folds the log into the database before the connection closes.
     fn close(&self) {
+        let said = self.files.storage.begin().and_then(|_writing| {
+            set_closed(&self.connection).map_err(failed("saying that it is closed"))
+        });
+        if let Err(error) = said {
+            tracing::warn!(%error, "the database does not say that it is closed");
+        }
         self.checkpoint();
         if let Err(error) = self.files.storage.check() {
             tracing::error!(%error, "the log is left as it is");
