@@ -8,6 +8,8 @@ export PATH := $(CURDIR)/.venv/bin:$(PATH)
 TEST_STEPS := fmt promtool deny clippy unit doc schemathesis compose
 PYTHON ?= python3
 FUZZ_SECONDS ?= 60
+# `make soak SECONDS=60`. The shell has a variable of that name, which is not meant.
+SOAK_SECONDS := $(if $(filter command line,$(origin SECONDS)),$(SECONDS),3600)
 MODEL ?= dinov2-vits14
 # The development profile optimises the kernels and the model, so that one build serves every step
 # of `make test`.
@@ -110,6 +112,11 @@ compose: model ## The composed system end to end (skips without Docker)
 .PHONY: fuzz
 fuzz: .venv/tools ## Each fuzz target for FUZZ_SECONDS (60)
 	fuzz/run.sh $(FUZZ_SECONDS)
+
+.PHONY: soak
+soak: ## SECONDS (3600) of 1.2x capacity and ten misbehaving clients beside an honest one
+	cargo build --release --locked
+	$(PYTHON) tests/soak.py --binary $(RELEASE_BIN) --seconds $(SOAK_SECONDS)
 
 # Valgrind knows no AVX-512, so under it the tests stop at AVX2; the sanitizer covers every level.
 .PHONY: valgrind

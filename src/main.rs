@@ -2,7 +2,7 @@
 
 use clap::Parser;
 use placeformer::cli::Cli;
-use placeformer::cli::output::OutputError;
+use placeformer::cli::output::{OutputError, report_failure};
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
@@ -15,7 +15,7 @@ fn main() -> ExitCode {
         }
         Err(error) => {
             // The chain of causes is for the user; a backtrace would only hide it.
-            eprintln!("error: {error:#}");
+            report_failure(&error);
             ExitCode::FAILURE
         }
     }

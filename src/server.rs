@@ -11,7 +11,7 @@ use crate::pipeline::{DescriptorSource, Parts, PipelineError, Service};
 use placeformer_core::progress::Progress;
 use placeformer_core::types::InvalidValue;
 use placeformer_models::open_extractor;
-use placeformer_store::{PlaceStore, SqliteStore, StoreConfig, StoreError};
+use placeformer_store::{LostTail, PlaceStore, SqliteStore, StoreConfig, StoreError};
 use placeformer_vision::extract::ExtractConfig;
 use std::error::Error;
 use std::future::Future;
@@ -25,6 +25,9 @@ use tokio_util::task::AbortOnDropHandle;
 
 /// Time between two checks of the disk's free space.
 const DISK_CHECK_INTERVAL: Duration = Duration::from_secs(2);
+
+/// Longest time in which a disk answers.
+const DISK_ANSWER_LIMIT: Duration = Duration::from_secs(20);
 
 /// How long blocking work may go on after the last request was answered.
 const BLOCKING_GRACE: Duration = Duration::from_secs(5);
@@ -116,15 +119,29 @@ pub fn open_model(
 /// Opens the embedded store in `directory`.
 ///
 /// # Errors
-/// Another process has it open, it is damaged or of a later version, or the disk fails.
+/// Another process has it open, it is damaged or of a later version, acknowledged commits are
+/// missing, or the disk fails.
 pub fn open_store(
     directory: &Path,
     config: &StoreConfig,
 ) -> Result<Arc<dyn PlaceStore>, OpenStoreError> {
-    let store = SqliteStore::open(directory, config).map_err(|source| OpenStoreError {
-        directory: directory.to_owned(),
-        source,
-    })?;
+    open_store_with(directory, config, LostTail::Refuse)
+}
+
+/// As [`open_store`]; `tail` says what to do if acknowledged commits are missing.
+///
+/// # Errors
+/// As [`open_store`].
+pub fn open_store_with(
+    directory: &Path,
+    config: &StoreConfig,
+    tail: LostTail,
+) -> Result<Arc<dyn PlaceStore>, OpenStoreError> {
+    let store =
+        SqliteStore::open_with(directory, config, tail).map_err(|source| OpenStoreError {
+            directory: directory.to_owned(),
+            source,
+        })?;
     Ok(Arc::new(store))
 }
 
@@ -189,10 +206,10 @@ pub async fn run_server(
         config.http.clone(),
         &config.auth,
         config.image.max_bytes,
-        metrics.clone(),
-        health.clone(),
+        metrics,
+        health,
     )?;
-    let watching = tokio::spawn(watch_disk(config.clone(), health, metrics));
+    let watching = tokio::spawn(watch_disk(config.clone(), state.clone()));
     let _watching = AbortOnDropHandle::new(watching);
     let opening = open(state.clone(), config, loaders);
     let serving = serve(listener, state, shutdown);
@@ -246,14 +263,44 @@ fn start_service(
 }
 
 /// Brings the health and the gauge of free bytes up to date with the disk, again and again.
-async fn watch_disk(config: Config, health: Arc<Health>, metrics: Arc<Metrics>) {
-    let reserve = config.pipeline.disk_reserve_bytes;
+async fn watch_disk(config: Config, state: AppState) {
     loop {
-        let directory = config.data.directory.clone();
-        if let Ok(Ok(space)) = spawn_blocking(move || disk::space(&directory)).await {
-            metrics.set_disk_free(space.free);
-            health.set_disk_full(space.is_short_of(reserve));
+        let look = {
+            let (config, state) = (config.clone(), state.clone());
+            spawn_blocking(move || look_at_disk(&config, &state))
+        };
+        tokio::pin!(look);
+        // A disk that does not answer is lost as long as that lasts. No second look is begun
+        // meanwhile, so that no threads pile up behind it.
+        if tokio::time::timeout(DISK_ANSWER_LIMIT, &mut look)
+            .await
+            .is_err()
+        {
+            let seconds = DISK_ANSWER_LIMIT.as_secs();
+            let reason = format!("the disk has not answered for {seconds} seconds");
+            state.health.set_storage_lost(Some(reason));
+            // A look that panicked has found out nothing; the next is as good.
+            let _ = look.await;
         }
         tokio::time::sleep(DISK_CHECK_INTERVAL).await;
+    }
+}
+
+/// Looks at the disk once. Blocks.
+fn look_at_disk(config: &Config, state: &AppState) {
+    let service = state.started();
+    match disk::space(&config.data.directory) {
+        Ok(space) => {
+            state.metrics.set_disk_free(space.free);
+            let reserve = config.pipeline.disk_reserve_bytes;
+            state.health.set_disk_full(space.is_short_of(reserve));
+        }
+        // Before the store is open the directory may not have been made.
+        Err(_) if service.is_none() => {}
+        // The store looks at its files itself, below, and says what it misses.
+        Err(error) => tracing::debug!(%error, "the free space of the disk cannot be read"),
+    }
+    if let Some(service) = service {
+        service.check_storage();
     }
 }

@@ -2,7 +2,7 @@
 
 use super::model_args::ModelOptions;
 use super::train::{HeadTrainArgs, train_head};
-use crate::cli::output::say;
+use crate::cli::output::{note, say};
 use crate::cli::progress::ProgressBars;
 use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
@@ -91,7 +91,7 @@ fn fit(args: FitArgs) -> anyhow::Result<()> {
     let extractor = open_extractor(&config, &progress)?;
     let fitted = fit_head(&extractor, &files, choice, &progress)?;
     for line in &fitted.unreadable {
-        eprintln!("left out: {line}");
+        note!("left out: {line}");
     }
     if let Some(directory) = args.out.parent() {
         std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;

@@ -1,7 +1,7 @@
 //! Match two images and draw the evidence.
 
 use super::model_args::ModelOptions;
-use crate::cli::output::{OutputError, say};
+use crate::cli::output::{OutputError, note, say};
 use crate::cli::progress::ProgressBars;
 use anyhow::{Context, bail};
 use placeformer_core::types::ScaleSet;
@@ -78,7 +78,7 @@ pub fn run(args: MatchArgs) -> anyhow::Result<()> {
         let path = &args.out;
         let bytes = encode(&picture(&query, &reference, &matches)?)?;
         std::fs::write(path, bytes).with_context(|| format!("cannot write {}", path.display()))?;
-        eprintln!("wrote {}", path.display());
+        note!("wrote {}", path.display());
     }
     Ok(())
 }

@@ -101,6 +101,15 @@ pub enum Command {
     /// Drive a server at a constant rate.
     Load(load::LoadArgs),
     /// Check every record of a store.
+    ///
+    /// A store whose database lacks commits that were acknowledged is not opened: its log was cut
+    /// short or deleted, or an older database was put in its place. The message says how many are
+    /// missing and since when; --accept-lost-tail gives them up.
+    ///
+    /// What it cannot see: records that were exchanged together with their checksums; the loss of
+    /// the database, its log and the file commit-mark together, or the exchange of all three for
+    /// those of an earlier moment. In a log that vanished while it was being folded into the
+    /// database, a commit may be there in part; that is found by reading, as any other damage.
     Verify(verify::VerifyArgs),
     /// Copy a store, also while a server runs on it.
     ///

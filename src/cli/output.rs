@@ -1,10 +1,18 @@
-//! Lines on standard output.
+//! Lines on standard output and standard error.
 //!
 //! `println!` panics when the reader of a pipe has gone, as `head` goes when it has enough.
-//! [`say!`] returns an error instead, on which `main` ends silently.
+//! [`say!`] returns an error instead, on which `main` ends silently. `eprintln!` panics likewise;
+//! [`note!`] tells the user something beside the result, and a note that cannot be written is no
+//! reason to end what is under way.
 
 use std::fmt;
-use std::io::{self, Write, stdout};
+use std::io::{self, Write, stderr, stdout};
+use std::sync::mpsc::sync_channel;
+use std::time::Duration;
+
+/// Longest wait for a terminal or pipe where waiting for ever would keep a process from its work
+/// or from its end.
+const PATIENCE: Duration = Duration::from_secs(2);
 
 /// Standard output took no more.
 #[derive(Debug, thiserror::Error)]
@@ -37,6 +45,39 @@ fn write_to(out: &mut impl Write, text: fmt::Arguments<'_>) -> Result<(), Output
     Ok(out.flush()?)
 }
 
+/// Writes a line to standard error, if it takes one.
+pub(super) fn write_note(text: fmt::Arguments<'_>) {
+    // There is nowhere else to say so.
+    let _ = writeln!(stderr().lock(), "{text}");
+}
+
+/// The outcome of `write`, which runs on a thread of its own; none if that has not ended soon,
+/// because nobody reads what it writes.
+pub(super) fn within_patience<T: Send + 'static>(
+    write: impl FnOnce() -> T + Send + 'static,
+) -> Option<T> {
+    let (done, outcome) = sync_channel(1);
+    let started = std::thread::Builder::new().spawn(move || {
+        // The receiver may have given up.
+        let _ = done.send(write());
+    });
+    started.ok()?;
+    outcome.recv_timeout(PATIENCE).ok()
+}
+
+/// Says why the process ends. Standard error may be a pipe that nobody reads, which must not keep
+/// it from ending.
+pub fn report_failure(error: &anyhow::Error) {
+    let text = format!("error: {error:#}");
+    // Without a reader nobody misses it.
+    let _ = within_patience(move || write_note(format_args!("{text}")));
+}
+
+/// `eprintln!` that never panics.
+macro_rules! note {
+    ($($text:tt)*) => { $crate::cli::output::write_note(format_args!($($text)*)) };
+}
+
 /// `println!` that returns an [`OutputError`].
 macro_rules! say {
     ($($text:tt)*) => { $crate::cli::output::write(format_args!("{}\n", format_args!($($text)*))) };
@@ -47,7 +88,11 @@ macro_rules! say_part {
     ($($text:tt)*) => { $crate::cli::output::write(format_args!($($text)*)) };
 }
 
-pub(super) use {say, say_part};
+#[cfg_attr(
+    not(feature = "lab"),
+    allow(unused_imports, reason = "the lab notes most")
+)]
+pub(super) use {note, say, say_part};
 
 #[cfg(test)]
 mod tests {

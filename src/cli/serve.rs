@@ -1,6 +1,6 @@
 //! Run the service.
 
-use crate::cli::output::{say, say_part};
+use crate::cli::output::{say, say_part, within_patience};
 use crate::cli::progress::ProgressBars;
 use crate::config::{Config, Overrides};
 use crate::ops::logging;
@@ -29,7 +29,8 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         say_part!("{}", config.to_annotated_toml()?)?;
         return Ok(());
     }
-    logging::init(&config.log)?;
+    // The last lines are written whichever way this ends.
+    let _flush = logging::init(&config.log)?;
     placeformer_kernels::self_check()?;
     let loaders = loaders(&config, Arc::new(ProgressBars::default()));
     serve_until_signal(config, loaders, print_address)?;
@@ -38,8 +39,11 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
 
 /// Prints where the server listens.
 pub(super) fn print_address(address: SocketAddr) {
-    // Whoever started the server may have closed the pipe already, which is no reason to stop.
-    if let Err(error) = say!("listening on http://{address}") {
-        tracing::warn!(%error, %address, "the address was not printed");
+    // Whoever started the server may have closed the pipe already, or left it full, which is no
+    // reason to stop or to wait.
+    match within_patience(move || say!("listening on http://{address}")) {
+        Some(Ok(())) => {}
+        Some(Err(error)) => tracing::warn!(%error, %address, "the address was not printed"),
+        None => tracing::warn!(%address, "nobody reads the address on standard output"),
     }
 }

@@ -2,8 +2,9 @@
 
 use crate::cli::output::{OutputError, say};
 use crate::config::{Config, Overrides};
+use crate::ops::logging;
 use anyhow::{Context, ensure};
-use placeformer_store::VerifyReport;
+use placeformer_store::{LostTail, VerifyReport};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -16,6 +17,10 @@ pub struct VerifyArgs {
     /// Settings of the store, as the server reads them (TOML).
     #[arg(long, env = "PLACEFORMER_CONFIG", value_name = "FILE")]
     config: Option<PathBuf>,
+    /// Open the store although acknowledged commits are missing, or may be, and give them up: the
+    /// log says what they were. From then on the store opens as it is.
+    #[arg(long)]
+    accept_lost_tail: bool,
     /// Print the report as JSON.
     #[arg(long)]
     json: bool,
@@ -29,7 +34,13 @@ pub fn run(args: VerifyArgs) -> anyhow::Result<()> {
         args.data.display()
     );
     let config = Config::load(args.config.as_deref(), &Overrides::default())?;
-    let store = crate::server::open_store(&args.data, &config.store)?;
+    let tail = if args.accept_lost_tail {
+        LostTail::Accept
+    } else {
+        LostTail::Refuse
+    };
+    let _flush = logging::init(&config.log)?;
+    let store = crate::server::open_store_with(&args.data, &config.store, tail)?;
     let report = store.verify().context("the store cannot be read")?;
     if args.json {
         print_json(&report)?;

@@ -108,7 +108,11 @@ const KEY_ERRORS: &[ErrorCode] = &[
 ];
 
 /// What the pipeline answers whatever it is asked for.
-const PIPELINE_ERRORS: &[ErrorCode] = &[ErrorCode::NotReady, ErrorCode::Overloaded];
+const PIPELINE_ERRORS: &[ErrorCode] = &[
+    ErrorCode::NotReady,
+    ErrorCode::Overloaded,
+    ErrorCode::StorageLost,
+];
 
 /// What the layers around every handler answer: the end of draining, and the net for panics.
 const LAYER_ERRORS: &[ErrorCode] = &[ErrorCode::ShuttingDown, ErrorCode::Internal];

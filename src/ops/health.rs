@@ -1,8 +1,9 @@
 //! Whether the server is ready, and if not, why.
 //!
 //! The whole process shares one [`Health`]. Start-up moves it from phase to phase, shutdown sets it
-//! to draining, and a full disk makes it unready until there is room again. `/readyz` prints the
-//! first reason found; `/readyz?for=query` ignores the disk, because queries need no room on it.
+//! to draining, and a disk that is full or cannot be written makes it unready until that is over.
+//! `/readyz` prints the first reason found; `/readyz?for=query` ignores the disk, because queries
+//! need no room on it.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -25,6 +26,12 @@ pub enum Unready {
     Draining,
     /// The disk is almost full: queries are answered, but nothing new is stored.
     DiskFull,
+    /// The files of the store are gone, exchanged, or cannot be written: queries are answered as
+    /// far as the store can be read, but nothing is stored, changed or deleted.
+    StorageLost {
+        /// What is wrong, for people.
+        reason: String,
+    },
 }
 
 impl Unready {
@@ -36,6 +43,7 @@ impl Unready {
             Self::BuildingIndex { .. } => "building_index",
             Self::Draining => "draining",
             Self::DiskFull => "disk_full",
+            Self::StorageLost { .. } => "storage_lost",
         }
     }
 }
@@ -59,6 +67,8 @@ pub struct Health {
     to_index: AtomicU64,
     draining: AtomicBool,
     disk_full: AtomicBool,
+    /// What is wrong with the files of the store, if anything.
+    storage_lost: Mutex<Option<String>>,
 }
 
 impl Default for Health {
@@ -69,6 +79,7 @@ impl Default for Health {
             to_index: AtomicU64::new(0),
             draining: AtomicBool::new(false),
             disk_full: AtomicBool::new(false),
+            storage_lost: Mutex::new(None),
         }
     }
 }
@@ -121,14 +132,43 @@ impl Health {
         self.disk_full.load(Ordering::Relaxed)
     }
 
+    /// The storage was lost, for this reason, or is back.
+    pub fn set_storage_lost(&self, lost: Option<String>) {
+        let mut known = self.storage();
+        if *known == lost {
+            return;
+        }
+        match &lost {
+            Some(reason) => tracing::error!(reason, "the storage is lost: nothing is stored"),
+            None => tracing::info!("the storage is back"),
+        }
+        *known = lost;
+    }
+
+    /// What is wrong with the files of the store; `None` if nothing is known to be.
+    pub fn storage_lost(&self) -> Option<String> {
+        self.storage().clone()
+    }
+
+    fn storage(&self) -> MutexGuard<'_, Option<String>> {
+        self.storage_lost
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// The reason for not being ready; `None` when ready.
     pub fn unready(&self) -> Option<Unready> {
+        let lost = || {
+            self.storage_lost()
+                .map(|reason| Unready::StorageLost { reason })
+        };
         self.unready_for_queries()
+            .or_else(lost)
             .or_else(|| self.is_disk_full().then_some(Unready::DiskFull))
     }
 
-    /// The reason for not answering queries; `None` when they are answered. A full disk is no
-    /// reason.
+    /// The reason for not answering queries; `None` when they are answered. A disk that is full or
+    /// cannot be written is no reason.
     pub fn unready_for_queries(&self) -> Option<Unready> {
         if self.is_draining() {
             return Some(Unready::Draining);
@@ -176,6 +216,12 @@ mod tests {
         health.set_disk_full(true);
         assert_eq!(health.unready(), Some(Unready::DiskFull));
         assert_eq!(health.unready_for_queries(), None);
+        let reason = "cannot find it".to_owned();
+        health.set_storage_lost(Some(reason.clone()));
+        assert_eq!(health.unready(), Some(Unready::StorageLost { reason }));
+        assert_eq!(health.unready_for_queries(), None);
+        health.set_storage_lost(None);
+        assert_eq!(health.unready(), Some(Unready::DiskFull));
         health.draining();
         assert_eq!(health.unready(), Some(Unready::Draining));
         assert_eq!(health.unready_for_queries(), Some(Unready::Draining));

@@ -89,6 +89,9 @@ pub enum PipelineError {
     /// The disk is almost full; the rest is kept for deletions.
     #[error("the disk that holds the store is full")]
     DiskFull,
+    /// The files of the store are gone, exchanged, or cannot be written.
+    #[error("the storage is lost: {0}")]
+    StorageLost(String),
     /// The deadline passed before any answer was ready.
     #[error("the deadline passed before {stage} was done")]
     DeadlineExceeded {
@@ -124,6 +127,7 @@ impl PipelineError {
             Self::Overloaded { .. } | Self::StoreBusy => ErrorCode::Overloaded,
             Self::MemoryPressure(_) => ErrorCode::MemoryPressure,
             Self::DiskFull => ErrorCode::DiskFull,
+            Self::StorageLost(_) => ErrorCode::StorageLost,
             Self::DeadlineExceeded { .. } => ErrorCode::DeadlineExceeded,
             Self::ShuttingDown => ErrorCode::ShuttingDown,
             Self::Panicked { .. } => ErrorCode::Internal,

@@ -101,7 +101,8 @@ impl Service {
         hashed.map_err(|_| PipelineError::Panicked { stage: "hashing" })
     }
 
-    /// The reference that this request repeats, found before anything costly is done.
+    /// The reference that this request repeats, found before anything costly is done. None if there
+    /// is none, or if it is not searchable yet.
     ///
     /// # Errors
     /// The external id names another image, or the store fails.
@@ -115,7 +116,13 @@ impl Service {
         };
         let map = request.map.clone();
         match self.find_external(map.clone(), external_id.clone()).await {
-            Ok(Some(reference)) if reference.content_hash == content_hash => Ok(Some(reference)),
+            Ok(Some(reference)) if reference.content_hash == content_hash => {
+                // One whose commit could not be acknowledged is stored, but not in the index: it is
+                // described again, and indexed.
+                let live = self.maps.live(&request.map);
+                let is_indexed = live.is_some_and(|live| live.index.global(reference.id).is_some());
+                Ok(is_indexed.then_some(reference))
+            }
             Ok(Some(_)) => Err(PipelineError::ExternalIdConflict { map, external_id }),
             Ok(None) => Ok(None),
             Err(error) => match error.code() {
@@ -137,6 +144,7 @@ impl Service {
         let service = self.clone();
         let committed = blocking(move || {
             let committed = service.commit_now(new);
+            service.note_lost_storage(&committed);
             drop(ticket);
             committed
         });
@@ -169,10 +177,15 @@ impl Service {
         self.follow_damage();
         let inserted = inserted?;
 
-        if let Inserted::Created(reference) = &inserted {
+        if let Inserted::Created(_) = &inserted {
             let global_bytes = global.len() * size_of::<f32>();
             self.metrics.stored_descriptor(global_bytes, patch_bytes);
-            entry.live_or_create(&model).index.insert(IndexEntry {
+        }
+        let (Inserted::Created(reference) | Inserted::AlreadyThere(reference)) = &inserted;
+        let live = entry.live_or_create(&model);
+        // One that was there may be missing from the index, if its commit was not acknowledged.
+        if live.index.global(reference.id).is_none() {
+            live.index.insert(IndexEntry {
                 id: reference.id,
                 global,
                 location: reference.fields.location,

@@ -132,11 +132,16 @@ impl Service {
         self.read(move |store| store.map(&name)).await
     }
 
-    /// Refuses new references while disk or memory is short. Deleting is never refused.
+    /// Refuses new references while the storage is lost, or disk or memory is short. Deleting is
+    /// not refused here.
     ///
     /// # Errors
-    /// The disk is almost full, or resident memory is above the watermark.
+    /// The storage is lost, the disk is almost full, or resident memory is above the watermark.
     pub fn may_store(&self) -> Result<(), PipelineError> {
+        if let Some(reason) = self.health.storage_lost() {
+            self.metrics.rejected(Rejection::StorageLost);
+            return Err(PipelineError::StorageLost(reason));
+        }
         if self.health.is_disk_full() {
             self.metrics.rejected(Rejection::DiskFull);
             return Err(PipelineError::DiskFull);
@@ -145,6 +150,28 @@ impl Service {
             .check()
             .inspect_err(|_| self.metrics.rejected(Rejection::MemoryPressure))?;
         Ok(())
+    }
+
+    /// Brings the health up to date with the files of the store. Blocks.
+    pub fn check_storage(&self) {
+        let lost = match self.store.check_storage() {
+            Err(StoreError::StorageLost { reason }) => Some(reason),
+            // A disk that is full, or a store that closes, is not lost.
+            Ok(()) | Err(_) => None,
+        };
+        self.health.set_storage_lost(lost);
+    }
+
+    /// Becomes unready for ingest if the store says that its storage is lost.
+    pub(super) fn note_lost_storage<T>(&self, outcome: &Result<T, PipelineError>) {
+        if let Err(PipelineError::Store(StoreError::StorageLost { reason })) = outcome {
+            self.metrics.rejected(Rejection::StorageLost);
+            // Only what the store says of itself now counts: one page that cannot be read is not
+            // the whole disk.
+            if self.store.check_storage().is_err() {
+                self.health.set_storage_lost(Some(reason.clone()));
+            }
+        }
     }
 
     /// Bounds the metadata of a reference.
@@ -292,6 +319,7 @@ impl Service {
         let service = self.clone();
         let outcome = blocking(move || {
             let outcome = work(&service);
+            service.note_lost_storage(&outcome);
             service.follow_damage();
             drop(permit);
             outcome

@@ -129,6 +129,60 @@ mod verify {
         assert_ne!(damaged[0]["reason"].as_str().unwrap(), "");
     }
 
+    /// What a killed process leaves of a store, without its log.
+    fn without_its_log() -> Closed {
+        let mut store = Closed::new();
+        let killed = tempfile::tempdir().unwrap();
+        let data = killed.path().join("data");
+        std::fs::create_dir(&data).unwrap();
+        let settings = store.folder.path().join("placeformer.toml");
+        std::fs::copy(settings, killed.path().join("placeformer.toml")).unwrap();
+        let config = StoreConfig {
+            reserve_bytes: 16 << 20,
+            ..StoreConfig::default()
+        };
+        let open = SqliteStore::open(&store.folder.path().join("data"), &config).unwrap();
+        for seed in 10..12 {
+            let new = named_reference(&map("city"), &format!("photo {seed}"), seed);
+            open.insert(new).unwrap();
+        }
+        for name in [SqliteStore::DATABASE, "commit-mark"] {
+            let from = store.folder.path().join("data").join(name);
+            std::fs::copy(from, data.join(name)).unwrap();
+        }
+        drop(open);
+        store.folder = killed;
+        store
+    }
+
+    #[test]
+    fn acknowledged_references_that_vanished_with_the_log_are_told_and_can_be_given_up() {
+        let store = without_its_log();
+        for _ in 0..2 {
+            let (said, error) = fails(store.folder.path(), &store.arguments(&[]));
+            assert_eq!(said, "");
+            assert!(
+                error.contains("2 of 5 acknowledged commits are missing"),
+                "{error}"
+            );
+            assert!(error.contains("new references among them: 2"), "{error}");
+        }
+        // Neither is it served, nor copied as if it were whole.
+        let (_, error) = fails(
+            store.folder.path(),
+            &["backup", "--data", "data", "--out", "copy"],
+        );
+        assert!(
+            error.contains("acknowledged commits are missing"),
+            "{error}"
+        );
+        let given_up = store.arguments(&["--accept-lost-tail"]);
+        let said = succeeds(store.folder.path(), &given_up);
+        assert_eq!(said, "3 references read\nall checksums hold\n");
+        let said = succeeds(store.folder.path(), &store.arguments(&[]));
+        assert_eq!(said, "3 references read\nall checksums hold\n");
+    }
+
     #[test]
     fn a_folder_without_a_store_is_named() {
         let folder = tempfile::tempdir().unwrap();

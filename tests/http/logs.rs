@@ -3,16 +3,39 @@
 
 use crate::disk::damage_patches;
 use crate::process::{Server, source};
-use crate::support::{App, BREAKS_THE_DECODER, BREAKS_THE_MODEL, picture};
+use crate::support::{App, BREAKS_THE_DECODER, BREAKS_THE_MODEL, PATIENCE, picture};
 use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 fn lines(log: &Path) -> Vec<Value> {
     let text = std::fs::read_to_string(log).unwrap();
-    text.lines()
+    // The last line may be half written at this moment.
+    let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+    whole
+        .lines()
         .map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("not JSON: {line}")))
         .collect()
+}
+
+/// The lines up to the answer of the request `id`. They are written after the answer is sent.
+fn lines_until_answered(log: &Path, id: &str) -> Vec<Value> {
+    let began = Instant::now();
+    loop {
+        let lines = lines(log);
+        let is_answer =
+            |line: &Value| line["message"] == "answered" && line["span"]["request_id"] == id;
+        if lines.iter().any(is_answer) {
+            return lines;
+        }
+        let waited = began.elapsed();
+        assert!(
+            waited < PATIENCE,
+            "no line says that {id} was answered: {lines:?}"
+        );
+        std::thread::sleep(Duration::from_millis(5));
+    }
 }
 
 const BROKEN: &str = "a blocking task failed";
@@ -68,7 +91,7 @@ fn every_line_of_a_request_carries_its_id_whatever_thread_it_comes_from() {
     for (id, path, body, status, expected) in cases {
         let (answered, answer) = server.post_as(id, path, body).unwrap();
         assert_eq!(answered, status, "{answer}");
-        let all = lines(&log);
+        let all = lines_until_answered(&log, id);
         let new = &all[seen..];
         for line in new {
             assert_eq!(

@@ -16,6 +16,7 @@ mod errors;
 mod index_rebuild;
 mod killed;
 mod logs;
+mod lost_storage;
 mod process;
 mod rehead;
 mod routes;

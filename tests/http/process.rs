@@ -44,13 +44,13 @@ fn child_that_serves_until_it_is_killed() {
     let Some(directory) = std::env::var_os(DIRECTORY) else {
         return;
     };
-    if std::env::var_os(LOGGED).is_some() {
-        logging::init(&LogConfig {
+    let _flush = std::env::var_os(LOGGED).map(|_| {
+        let config = LogConfig {
             format: LogFormat::Json,
             ..LogConfig::default()
-        })
-        .unwrap();
-    }
+        };
+        logging::init(&config).unwrap()
+    });
     let mut config = Config {
         store: store_config(),
         ..Config::default()

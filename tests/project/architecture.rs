@@ -93,8 +93,8 @@ fn broken_macros(package: &str, module: &str, names: &Names) -> Vec<String> {
     let writes_to_user = package == SERVICE && (module == "cli" || module == "main");
     let (forbidden, instead) = if writes_to_user {
         (
-            &["println", "print", "dbg"][..],
-            "it panics on a closed pipe; use say!",
+            TERMINAL_MACROS,
+            "it panics on a closed pipe; use say! or note!",
         )
     } else {
         (TERMINAL_MACROS, "a library logs; use tracing")
@@ -208,6 +208,12 @@ fn every_rule_can_fail() {
         (SERVICE, "http", "fn f() { println!(\"x\") }", "use tracing"),
         (SERVICE, "cli", "fn f() { println!(\"x\") }", "closed pipe"),
         (
+            SERVICE,
+            "main",
+            "fn f() { eprintln!(\"x\") }",
+            "closed pipe",
+        ),
+        (
             "store",
             "codec",
             "fn f() { eprintln!(\"x\") }",
@@ -241,7 +247,7 @@ fn every_rule_can_fail() {
             "http",
             "use crate::{pipeline::Service, ops::Metrics}; fn f() -> axum::Router { a.axum() }",
         ),
-        (SERVICE, "cli", "fn f() { eprintln!(\"x\"); self::g(); }"),
+        (SERVICE, "cli", "fn f() { note!(\"x\"); self::g(); }"),
         (SERVICE, "lib", "pub use crate::cli::Cli;"),
         (
             "vision",

@@ -146,6 +146,9 @@ error_codes! {
     /// No space is left to store it.
     DiskFull = "disk_full", 507, true, Some(30),
         "The disk is full";
+    /// The files of the store are gone, exchanged, or cannot be written.
+    StorageLost = "storage_lost", 507, true, Some(30),
+        "The storage cannot be written";
 }
 
 #[cfg(test)]

@@ -149,6 +149,10 @@ impl MaintainPlaces for CombinedStore {
         self.maintenance.backup(target)
     }
 
+    fn check_storage(&self) -> Result<(), StoreError> {
+        self.maintenance.check_storage()
+    }
+
     fn footprint(&self) -> Result<Footprint, StoreError> {
         self.maintenance.footprint()
     }

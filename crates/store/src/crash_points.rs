@@ -21,8 +21,12 @@ pub const BEFORE_BEGIN: &str = "before_begin";
 pub const MID_INSERT: &str = "mid_insert";
 /// Every job of the group has written, nothing is committed.
 pub const BEFORE_COMMIT: &str = "before_commit";
-/// The group is durable, its callers have not been answered.
+/// The group is durable, the commit mark does not say so yet.
 pub const AFTER_COMMIT: &str = "after_commit";
+/// Half of the new commit mark is written.
+pub const MID_MARK: &str = "mid_mark";
+/// The commit mark is durable, the callers of the group have not been answered.
+pub const AFTER_MARK: &str = "after_mark";
 /// A map is marked as deleted, its references still lie on disk.
 pub const MAP_DELETED: &str = "map_deleted";
 /// One batch of a deleted map is removed, uncommitted.
@@ -38,6 +42,8 @@ pub const ALL: &[&str] = &[
     MID_INSERT,
     BEFORE_COMMIT,
     AFTER_COMMIT,
+    MID_MARK,
+    AFTER_MARK,
     MAP_DELETED,
     MID_PURGE,
     MID_REHEAD,

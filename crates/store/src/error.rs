@@ -108,6 +108,56 @@ pub enum StoreError {
     /// No space is left for writing; reading and deleting still work.
     #[error("no space is left on the disk of the data directory")]
     DiskFull,
+    /// The files of the store cannot be written, or are no longer those in the data directory, so
+    /// that nothing may be acknowledged; what can be read is.
+    #[error("the storage is lost: {reason}")]
+    StorageLost {
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The database lacks commits that were acknowledged.
+    #[error(
+        "{lost} of {marked} acknowledged commits are missing from the database in {}, the last of \
+         {at} (new references among them: {references}): its log was cut short or deleted, or an \
+         older database was put in its place. Restore the log or a backup, or give them up with \
+         `placeformer verify --accept-lost-tail`",
+        directory.display()
+    )]
+    LostCommits {
+        /// The data directory.
+        directory: PathBuf,
+        /// Commits that are missing.
+        lost: i64,
+        /// Commits that were acknowledged.
+        marked: i64,
+        /// New references in the missing commits.
+        references: i64,
+        /// When the last of them was acknowledged.
+        at: time::OffsetDateTime,
+    },
+    /// Nobody can say whether the database lacks commits that were acknowledged.
+    #[error(
+        "{} {reason}, so nobody can say whether the newest commits are in the database. Put it \
+         back, restore a backup, or go on with what is there with \
+         `placeformer verify --accept-lost-tail`",
+        path.display()
+    )]
+    NoCommitMark {
+        /// Where the mark should be.
+        path: PathBuf,
+        /// What is there instead.
+        reason: &'static str,
+    },
+    /// A log lies beside a database that has none, and would be applied to it.
+    #[error(
+        "{} is the log of another database than the one beside it: move it away, or put its own \
+         database back",
+        path.display()
+    )]
+    ForeignLog {
+        /// The log.
+        path: PathBuf,
+    },
     /// Another process uses the data directory.
     #[error("the data directory {} is in use by another process ({holder})", directory.display())]
     Locked {
@@ -192,9 +242,13 @@ impl StoreError {
             | Self::CorruptHead { .. }
             | Self::Damaged { .. } => ErrorCode::CorruptRecord,
             Self::DiskFull => ErrorCode::DiskFull,
+            Self::StorageLost { .. } => ErrorCode::StorageLost,
             Self::Busy { .. } | Self::ReheadInProgress { .. } => ErrorCode::Overloaded,
             Self::Closing => ErrorCode::ShuttingDown,
             Self::InvalidDescriptor { .. }
+            | Self::LostCommits { .. }
+            | Self::NoCommitMark { .. }
+            | Self::ForeignLog { .. }
             | Self::Locked { .. }
             | Self::SchemaTooNew { .. }
             | Self::MigrationChanged { .. }

@@ -30,5 +30,5 @@ pub use records::{
     Damage, Footprint, GlobalRow, Inserted, MapInfo, NewHead, Page, Quarantined, ReferencePatch,
     VerifyReport,
 };
-pub use sqlite::SqliteStore;
+pub use sqlite::{LostTail, SqliteStore};
 pub use traits::{HeadExchange, MaintainPlaces, PlaceStore, ReadPlaces, WritePlaces};

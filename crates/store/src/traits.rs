@@ -104,7 +104,9 @@ pub trait ReadPlaces: Send + Sync {
 /// Writing maps and references.
 ///
 /// A write returns only after it is fsynced. Every method fails with [`StoreError::DiskFull`] if
-/// there is no room for it, and with [`StoreError::Closing`] while the store is closing.
+/// there is no room for it, with [`StoreError::StorageLost`] if the files of the store are gone,
+/// exchanged or cannot be written, and with [`StoreError::Closing`] while the store is closing.
+/// After [`StoreError::StorageLost`] the write may or may not be there once the storage is back.
 pub trait WritePlaces: Send + Sync {
     /// Stores a reference, creating its map on first use.
     ///
@@ -193,6 +195,15 @@ pub trait MaintainPlaces: Send + Sync {
     /// # Errors
     /// `target` exists, or cannot be written.
     fn backup(&self, target: &Path) -> Result<u64, StoreError>;
+
+    /// Whether writes would be kept: the files that are open are still those of the store, on a
+    /// disk that takes them. Cheap enough to be called every second.
+    ///
+    /// # Errors
+    /// [`StoreError::StorageLost`], with the reason.
+    fn check_storage(&self) -> Result<(), StoreError> {
+        Ok(())
+    }
 
     /// The room that the store takes on disk and in memory.
     ///

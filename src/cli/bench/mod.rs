@@ -6,7 +6,7 @@ mod service;
 mod table;
 
 use super::model_args::ModelOptions;
-use crate::cli::output::say;
+use crate::cli::output::{note, say};
 use crate::cli::progress::ProgressBars;
 use anyhow::{Context, ensure};
 use end_to_end::{EndToEnd, EndToEndRow};
@@ -91,7 +91,7 @@ struct Report {
 /// Runs it.
 pub fn run(args: BenchArgs) -> anyhow::Result<()> {
     if cfg!(debug_assertions) {
-        eprintln!(
+        note!(
             "warning: this is a development build; its times mean nothing (cargo build --release)"
         );
     }
@@ -183,7 +183,7 @@ fn rows(bench: &Bench, only: &[String]) -> anyhow::Result<Vec<BenchRow>> {
             Ok(row) => rows.push(row),
             // Named rows must be measured; of all rows, those this CPU can.
             Err(BenchError::Extract(error @ ExtractError::Precision { .. })) if only.is_empty() => {
-                bars.suspend(&mut || eprintln!("left out {name}: {error}"));
+                bars.suspend(&mut || note!("left out {name}: {error}"));
             }
             Err(error) => return Err(error.into()),
         }
@@ -208,7 +208,7 @@ struct TemporaryFolder(PathBuf);
 impl Drop for TemporaryFolder {
     fn drop(&mut self) {
         if let Err(error) = std::fs::remove_dir_all(&self.0) {
-            eprintln!("warning: {} is left behind: {error}", self.0.display());
+            note!("warning: {} is left behind: {error}", self.0.display());
         }
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::cli::choice::choice;
 use crate::cli::data_args::ReadArgs;
+use crate::cli::output::note;
 use anyhow::{bail, ensure};
 use placeformer_core::types::ScaleSet;
 use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions};
@@ -167,7 +168,7 @@ impl DataArgs {
         } else {
             bail!("give --dataset and --root, or --database, --queries and --ground-truth");
         };
-        eprintln!(
+        note!(
             "{}: {} references, {} queries",
             dataset.name,
             dataset.database.len(),

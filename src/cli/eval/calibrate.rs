@@ -5,7 +5,7 @@ use super::{describe, open_describer, write};
 use crate::cli::choice::choice;
 use crate::cli::client::{ServerArgs, ServerClient};
 use crate::cli::model_args::ModelOptions;
-use crate::cli::output::say_part;
+use crate::cli::output::{note, say_part};
 use crate::cli::progress::ProgressBars;
 use anyhow::{Context, ensure};
 use placeformer_core::types::{Calibration, MapName};
@@ -85,7 +85,7 @@ pub(super) fn run(args: CalibrateArgs) -> anyhow::Result<()> {
     let describer = open_describer(&extract)?;
     let own = OwnPlaces::of(&dataset, args.fit.leave_out, args.data.radius);
     if own.is_some() {
-        eprintln!("each query is also asked with its own place left out of the database");
+        note!("each query is also asked with its own place left out of the database");
     }
     let rerank = args.rerank.config();
     let progress = ProgressBars::default();
@@ -127,6 +127,6 @@ fn store(server: ServerArgs, map: &MapName, calibration: &Calibration) -> anyhow
         stored["model"] == calibration.model().as_str(),
         "the server stored something else: {stored}"
     );
-    eprintln!("stored with map {map} at {address}");
+    note!("stored with map {map} at {address}");
     Ok(())
 }

@@ -3,7 +3,7 @@
 use super::args::{DataArgs, MethodArgs, OutputArgs};
 use super::{describe, open_describer, write};
 use crate::cli::model_args::ModelOptions;
-use crate::cli::output::say_part;
+use crate::cli::output::{note, say_part};
 use crate::cli::progress::ProgressBars;
 use anyhow::{Context, bail};
 use maud::html;
@@ -52,7 +52,7 @@ pub(super) fn run(args: MeasureArgs) -> anyhow::Result<()> {
     if args.method.ablate {
         let Ablation { rows, left_out } = run_ablation(&args, &dataset, &extract)?;
         for row in left_out {
-            eprintln!("left out {row} (--patch-memory)");
+            note!("left out {row} (--patch-memory)");
         }
         say_part!("\n{}", report::ablation_text(&rows))?;
         ablation = Some(report::ablation_html(&rows));
@@ -104,7 +104,7 @@ fn measure(
     let mut own = None;
     if method.leave_out {
         own = OwnPlaces::of(dataset, LeaveOut::Always, args.data.radius);
-        eprintln!("each query is also asked with its own place left out of the database");
+        note!("each query is also asked with its own place left out of the database");
     }
 
     let progress = ProgressBars::default();
@@ -143,7 +143,7 @@ fn write_predictions(
         Some(DatasetKind::MslsTest | DatasetKind::MslsVal) => {
             let unanswered = prediction::write_msls(path, dataset, answers)?;
             if unanswered > 0 {
-                eprintln!(
+                note!(
                     "warning: {unanswered} of the queries could not be answered; their lines name \
                      references that mean nothing, because the official evaluation wants a line \
                      for every query"
@@ -153,7 +153,7 @@ fn write_predictions(
         Some(DatasetKind::RobotcarSeasonsV2) => prediction::write_robotcar(path, dataset, answers)?,
         _ => bail!("only MSLS and RobotCar Seasons have a prediction file"),
     }
-    eprintln!("wrote {}", path.display());
+    note!("wrote {}", path.display());
     Ok(())
 }
 

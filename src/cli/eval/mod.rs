@@ -4,6 +4,7 @@ mod args;
 mod calibrate;
 mod measure;
 
+use crate::cli::output::note;
 use crate::cli::progress::ProgressBars;
 use anyhow::Context;
 use args::CacheArgs;
@@ -86,7 +87,7 @@ fn describe(
     let described = DescribedDataset::new(describer, cache, dataset, global, progress)?;
     let images = dataset.database.len() + dataset.queries.len();
     let fresh = described.fresh();
-    eprintln!(
+    note!(
         "described {fresh} images, {} more were cached or unreadable",
         images - fresh
     );
@@ -95,6 +96,6 @@ fn describe(
 
 fn write(path: &Path, text: &str) -> anyhow::Result<()> {
     std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
-    eprintln!("wrote {}", path.display());
+    note!("wrote {}", path.display());
     Ok(())
 }

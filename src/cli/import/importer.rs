@@ -3,6 +3,7 @@
 use super::metadata::Metadata;
 use super::report::{ImportReport, PhotoRecord, Status};
 use super::sink::{self, Outcome, Sink, Upload};
+use crate::cli::output::note;
 use placeformer_core::progress::{Progress, Task};
 use placeformer_core::types::{ContentHash, ExternalId, MapName};
 use std::collections::HashMap;
@@ -101,7 +102,7 @@ impl Importer<'_> {
             detail,
             attempts,
         } = failure;
-        self.progress.suspend(&mut || eprintln!("{name}: {detail}"));
+        self.progress.suspend(&mut || note!("{name}: {detail}"));
         if sink::is_hopeless(&code) {
             queue.stop(detail.clone());
         }

@@ -14,7 +14,7 @@ mod sink;
 mod store_sink;
 
 use crate::cli::client::ServerArgs;
-use crate::cli::output::say;
+use crate::cli::output::{note, say};
 use crate::cli::progress::ProgressBars;
 use crate::config::ModelOverrides;
 use anyhow::{Context, bail, ensure};
@@ -123,7 +123,7 @@ fn read_metadata(args: &ImportArgs, images: &[(String, PathBuf)]) -> anyhow::Res
     let unmatched = metadata.without_image(names);
     if let Some(example) = unmatched.first() {
         let count = unmatched.len();
-        eprintln!("warning: {count} rows of the positions file name no image, such as {example:?}");
+        note!("warning: {count} rows of the positions file name no image, such as {example:?}");
     }
     Ok(metadata)
 }

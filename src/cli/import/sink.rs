@@ -54,6 +54,7 @@ pub(super) fn is_hopeless(code: &str) -> bool {
         ErrorCode::Forbidden,
         ErrorCode::ModelMismatch,
         ErrorCode::DiskFull,
+        ErrorCode::StorageLost,
         ErrorCode::RouteNotFound,
         ErrorCode::ShuttingDown,
     ];

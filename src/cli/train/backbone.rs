@@ -2,7 +2,7 @@
 
 use super::head::open_cache;
 use super::{RunArgs, facts, finish, notes};
-use crate::cli::output::say;
+use crate::cli::output::{note, say};
 use crate::cli::progress::ProgressBars;
 use anyhow::ensure;
 use placeformer_lab::train::{
@@ -24,7 +24,7 @@ pub(super) fn train(
     placeformer_kernels::self_check()?;
     let config = args.config(augmentation)?;
     let sides = args.data.load(args.method.seed)?;
-    eprintln!("{}", sides.description);
+    note!("{}", sides.description);
     let extract = args.model.extract_config()?;
     let progress = ProgressBars::default();
     let start = head_to_start_from(args, &extract, &sides.training, &progress)?;

@@ -2,6 +2,7 @@
 
 use crate::cli::choice::choice;
 use crate::cli::data_args::ReadArgs;
+use crate::cli::output::note;
 use anyhow::{Context, ensure};
 use placeformer_lab::datasets::{DatasetKind, DatasetOptions, Split};
 use placeformer_lab::train::{Holdout, Sources, TripletRule, TripletSet, refuse_shared_images};
@@ -194,7 +195,7 @@ fn read(
     let sources = Sources::read(&named, options, drives)?;
     for dataset in &sources.datasets {
         for note in &dataset.notes {
-            eprintln!("{}: {note}", dataset.name);
+            note!("{}: {note}", dataset.name);
         }
     }
     Ok(sources)

@@ -1,6 +1,7 @@
 //! Training the head alone, on pooled tokens.
 
 use super::{HeadTrainArgs, RunArgs, facts, finish, notes};
+use crate::cli::output::note;
 use crate::cli::progress::ProgressBars;
 use anyhow::Context;
 use placeformer_lab::train::{
@@ -18,7 +19,7 @@ pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
     placeformer_kernels::self_check()?;
     let config = args.config(Augmentation::NONE)?;
     let sides = args.data.load(args.method.seed)?;
-    eprintln!("{}", sides.description);
+    note!("{}", sides.description);
     let extract = args.model.extract_config()?;
     let progress = ProgressBars::default();
     let extractor = open_extractor(&extract, &progress)?;

@@ -24,11 +24,14 @@ pub struct LiveBody {
 #[derive(Debug, Serialize, ToSchema)]
 pub struct ReadyBody {
     /// `ready`, or why not: `loading_model`, `migrating`, `building_index`, `draining`,
-    /// `disk_full`.
+    /// `storage_lost`, `disk_full`.
     #[schema(example = "ready")]
     status: &'static str,
     /// Progress of `building_index`: references indexed and in all.
     progress: Option<ProgressBody>,
+    /// Of `storage_lost`: what is wrong.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    detail: Option<String>,
 }
 
 /// How far the index is.
@@ -78,7 +81,9 @@ enum ReadyFor {
 ///
 /// 503 with the reason while it cannot; send requests elsewhere meanwhile, do not restart it. A
 /// balancer should ask `/readyz?for=query`: a full disk (`disk_full`) keeps a server from storing,
-/// which it answers with 507 itself, but not from answering queries and deleting.
+/// which it answers with 507 itself, but not from answering queries and deleting. Neither does a
+/// data directory that has gone or cannot be written (`storage_lost`) keep it from answering
+/// queries.
 #[utoipa::path(
     get,
     path = "/readyz",
@@ -104,16 +109,20 @@ fn answer(unready: Option<Unready>) -> Response {
         return Json(ReadyBody {
             status: "ready",
             progress: None,
+            detail: None,
         })
         .into_response();
     };
-    let progress = match reason {
-        Unready::BuildingIndex { done, total } => Some(ProgressBody { done, total }),
-        _ => None,
+    let status = reason.as_str();
+    let (progress, detail) = match reason {
+        Unready::BuildingIndex { done, total } => (Some(ProgressBody { done, total }), None),
+        Unready::StorageLost { reason } => (None, Some(reason)),
+        _ => (None, None),
     };
     let body = ReadyBody {
-        status: reason.as_str(),
+        status,
         progress,
+        detail,
     };
     let mut response = (
         StatusCode::SERVICE_UNAVAILABLE,

@@ -68,11 +68,13 @@ pub enum Rejection {
     Deadline,
     /// Its client left.
     ClientGone,
+    /// The files of the store are gone, exchanged, or cannot be written.
+    StorageLost,
 }
 
 impl Rejection {
     /// All reasons.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::QueueFull,
         Self::StoreBusy,
         Self::BodyMemory,
@@ -83,6 +85,7 @@ impl Rejection {
         Self::Draining,
         Self::Deadline,
         Self::ClientGone,
+        Self::StorageLost,
     ];
 
     /// Its label.
@@ -94,6 +97,7 @@ impl Rejection {
             Self::RateLimited => "rate_limited",
             Self::MemoryPressure => "memory_pressure",
             Self::DiskFull => "disk_full",
+            Self::StorageLost => "storage_lost",
             Self::NotReady => "not_ready",
             Self::Draining => "draining",
             Self::Deadline => "deadline",

@@ -8,12 +8,14 @@ mod labels;
 
 pub use labels::{MemoryComponent, PipelineStage, Rejection};
 
+use super::logging;
 use prometheus::core::Collector;
 use prometheus::process_collector::ProcessCollector;
 use prometheus::{
     Encoder, Error, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge,
     IntGaugeVec, Opts, Registry, TextEncoder,
 };
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 /// Upper bounds in seconds, 1 ms to 10 s.
@@ -63,6 +65,7 @@ pub struct Metrics {
     ready: IntGauge,
     disk_free_bytes: IntGauge,
     cache_lookups: IntCounterVec,
+    lost_log_lines: LostLogLines,
 }
 
 impl Metrics {
@@ -114,6 +117,7 @@ impl Metrics {
                 "Key patches asked of the cache.",
                 &["result"],
             )?,
+            lost_log_lines: LostLogLines::new(&series)?,
             registry: series.0,
         };
         metrics.start_at_zero();
@@ -260,6 +264,7 @@ impl Metrics {
     /// # Errors
     /// A series cannot be written as text.
     pub fn render(&self) -> Result<String, Error> {
+        self.lost_log_lines.follow(logging::lost_lines());
         TextEncoder::new().encode_to_string(&self.registry.gather())
     }
 
@@ -312,6 +317,30 @@ impl QuerySeries {
                 "Queries whose best answer is not trusted.",
             )?,
         })
+    }
+}
+
+/// Log lines that were lost in this process, which counts them before there are any metrics.
+struct LostLogLines {
+    counter: IntCounter,
+    counted: AtomicU64,
+}
+
+impl LostLogLines {
+    fn new(series: &Series) -> Result<Self, Error> {
+        Ok(Self {
+            counter: series.counter(
+                "log_lines_dropped_total",
+                "Log lines that nobody took: standard error was full, closed or not read.",
+            )?,
+            counted: AtomicU64::new(0),
+        })
+    }
+
+    /// Brings the counter to `lost`, which never falls; safe from several threads at once.
+    fn follow(&self, lost: u64) {
+        let counted = self.counted.fetch_max(lost, Ordering::Relaxed);
+        self.counter.inc_by(lost.saturating_sub(counted));
     }
 }
 
@@ -387,6 +416,8 @@ mod tests {
             "placeformer_queue_depth 0",
             "placeformer_query_top1_score_count 0",
             "placeformer_query_unmatched_total 0",
+            "placeformer_log_lines_dropped_total 0",
+            "placeformer_rejected_total{reason=\"storage_lost\"} 0",
             "placeformer_build_info{version=",
             "process_resident_memory_bytes",
         ] {

@@ -6,6 +6,8 @@
 
 use super::directory::io;
 use super::engine::failed;
+use super::mark::CommitMark;
+use super::sequence::progress;
 use crate::error::StoreError;
 use placeformer_core::files::{directory_of, sync_directory, with_suffix};
 use rusqlite::Connection;
@@ -17,15 +19,19 @@ use std::path::Path;
 const PAGES_PER_STEP: i32 = 256;
 
 /// Copies the database behind `connection` to `target`, which must not exist; returns its size in
-/// bytes.
-pub(super) fn write(connection: &Connection, target: &Path) -> Result<u64, StoreError> {
+/// bytes. A copy that has not come as far as `least` is refused.
+pub(super) fn write(
+    connection: &Connection,
+    target: &Path,
+    least: Option<CommitMark>,
+) -> Result<u64, StoreError> {
     if target.exists() {
         return Err(StoreError::BackupExists {
             path: target.to_owned(),
         });
     }
     let partial = with_suffix(target, ".partial");
-    if let Err(error) = copy(connection, &partial) {
+    if let Err(error) = copy(connection, &partial, least) {
         // The caller needs the first error, so a failure to remove the rest is not reported.
         let _ = fs::remove_file(&partial);
         return Err(error);
@@ -45,7 +51,7 @@ pub(super) fn write(connection: &Connection, target: &Path) -> Result<u64, Store
     Ok(bytes)
 }
 
-fn copy(source: &Connection, partial: &Path) -> Result<(), StoreError> {
+fn copy(source: &Connection, partial: &Path, least: Option<CommitMark>) -> Result<(), StoreError> {
     let failed = failed("copying it");
     let mut target = Connection::open(partial).map_err(&failed)?;
     // The snapshot keeps concurrent writers from restarting the copy. It begins with the first
@@ -67,6 +73,12 @@ fn copy(source: &Connection, partial: &Path) -> Result<(), StoreError> {
         }
     }
     drop(backup);
+    if let Some(least) = least {
+        let reached = progress(&target).map_err(&failed)?;
+        if let Some(error) = least.missing(reached, directory_of(partial)) {
+            return Err(error);
+        }
+    }
     // The copy is one file without a log.
     target
         .pragma_update_and_check(None, "journal_mode", "delete", |_| Ok(()))

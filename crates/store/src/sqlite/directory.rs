@@ -10,7 +10,8 @@ use std::path::{Path, PathBuf};
 
 /// Name of the database inside the data directory.
 pub(super) const DATABASE: &str = "placeformer.db";
-const LOCK: &str = "LOCK";
+/// Name of the file that is locked inside the data directory.
+pub(super) const LOCK: &str = "LOCK";
 
 /// Makes a function that turns an error of the file system into ours.
 pub(super) fn io(
@@ -61,6 +62,11 @@ impl DataDirectory {
             _lock: lock,
             path: path.to_owned(),
         })
+    }
+
+    /// The directory itself.
+    pub(super) fn path(&self) -> &Path {
+        &self.path
     }
 
     /// Path of the database.

@@ -30,11 +30,17 @@ const LEAST_LOG_PAGES: u64 = 16;
 /// full.
 const SHM_CANNOT_GROW: i32 = 4874;
 
+/// Extended code of an operation that failed for want of memory (`SQLITE_IOERR_NOMEM`), which says
+/// nothing about the disk.
+const IO_OUT_OF_MEMORY: i32 = 3082;
+
 /// What a failure reported by the engine itself means.
 enum Failure {
     DiskFull,
     Busy,
     Damaged,
+    /// The system refused to read or write.
+    Storage,
     Other,
 }
 
@@ -47,6 +53,8 @@ fn classify(error: &SqliteError) -> Failure {
         _ if cause.extended_code == SHM_CANNOT_GROW => Failure::DiskFull,
         SqliteCode::DatabaseBusy | SqliteCode::DatabaseLocked => Failure::Busy,
         SqliteCode::DatabaseCorrupt | SqliteCode::NotADatabase => Failure::Damaged,
+        SqliteCode::SystemIoFailure if cause.extended_code == IO_OUT_OF_MEMORY => Failure::Other,
+        SqliteCode::SystemIoFailure | SqliteCode::ReadOnly => Failure::Storage,
         _ => Failure::Other,
     }
 }
@@ -59,6 +67,9 @@ pub(super) fn failed(context: &'static str) -> impl Fn(SqliteError) -> StoreErro
         Failure::Damaged => StoreError::Damaged {
             context,
             source: EngineCause::from(error),
+        },
+        Failure::Storage => StoreError::StorageLost {
+            reason: format!("the disk failed while {context}: {error}"),
         },
         Failure::Other => StoreError::Engine {
             context,

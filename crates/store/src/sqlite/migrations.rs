@@ -19,6 +19,10 @@ const MIGRATIONS: &[(&str, &str)] = &[
         "map_head",
         include_str!("../../../../migrations/sqlite/0002_map_head.sql"),
     ),
+    (
+        "commit_count",
+        include_str!("../../../../migrations/sqlite/0003_commit_count.sql"),
+    ),
 ];
 
 const HISTORY: &str = "CREATE TABLE IF NOT EXISTS schema_migration (

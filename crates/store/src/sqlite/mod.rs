@@ -8,6 +8,8 @@
 //! | `keys.rs`, `checksum.rs`, `row.rs` | what all rows have in common |
 //! | `map_row.rs`, `reference_row.rs`, `parts.rs`, `sequence.rs` | the rows of each table |
 //! | `job.rs`, `writer.rs` | the one writing thread and its group commit |
+//! | `storage.rs` | whether what is open is still what lies in the data directory |
+//! | `mark.rs`, `tail.rs` | the number of the last commit; whether a database has reached it |
 //! | `insert.rs`, `change.rs`, `remove.rs`, `purge.rs` | what is written |
 //! | `database.rs`, `quarantine.rs` | all connections; references known to be damaged |
 //! | `read.rs`, `page.rs`, `globals.rs` | what is read |
@@ -25,6 +27,7 @@ mod insert;
 mod job;
 mod keys;
 mod map_row;
+mod mark;
 mod migrations;
 mod page;
 mod parts;
@@ -38,6 +41,8 @@ mod replace_head;
 mod reserve;
 mod row;
 mod sequence;
+mod storage;
+mod tail;
 mod verify;
 mod writer;
 
@@ -49,7 +54,9 @@ use self::map_row::MapRow;
 use self::quarantine::Quarantine;
 use self::readers::Readers;
 use self::reserve::Reserve;
-use self::writer::Writer;
+use self::storage::Storage;
+pub use self::tail::LostTail;
+use self::writer::{Files, Writer};
 use crate::config::StoreConfig;
 use crate::crash_points;
 use crate::error::StoreError;
@@ -63,6 +70,7 @@ use placeformer_core::types::{
     Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
 };
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Bytes that a change of metadata adds to the store, about.
 const PATCH_BYTES: usize = 1024;
@@ -76,8 +84,9 @@ pub struct SqliteStore {
     // still locked.
     database: Database,
     path: PathBuf,
+    storage: Arc<Storage>,
     config: StoreConfig,
-    _directory: DataDirectory,
+    directory: DataDirectory,
 }
 
 impl SqliteStore {
@@ -88,29 +97,53 @@ impl SqliteStore {
     ///
     /// # Errors
     /// [`StoreError::Locked`] while another process has it open, [`StoreError::SchemaTooNew`] if a
-    /// newer release wrote it, or whatever keeps the database from being opened.
+    /// newer release wrote it, [`StoreError::LostCommits`] or [`StoreError::NoCommitMark`] if
+    /// acknowledged commits are missing or may be, or whatever keeps the database from being
+    /// opened.
     pub fn open(directory: &Path, config: &StoreConfig) -> Result<Self, StoreError> {
+        Self::open_with(directory, config, LostTail::Refuse)
+    }
+
+    /// As [`SqliteStore::open`]; `tail` says what to do if acknowledged commits are missing.
+    ///
+    /// # Errors
+    /// As [`SqliteStore::open`].
+    pub fn open_with(
+        directory: &Path,
+        config: &StoreConfig,
+        tail: LostTail,
+    ) -> Result<Self, StoreError> {
         let claimed = DataDirectory::claim(directory)?;
         let reserve = Reserve::take(directory, config)?;
         let path = claimed.database();
         let is_new = !path.exists();
+        let needed = tail::inspect(directory, config, tail)?;
         let mut connection = engine::open_writer(&path, config, reserve.log_bytes(config))?;
         migrations::apply(&mut connection)?;
         if is_new {
             sync_directory(directory).map_err(directory::io("cannot sync directory", directory))?;
         }
+        let mark = tail::attach(directory, &connection, needed)?;
+        tail::begin(&connection);
         purge::abandon_unfinished_heads(&connection)?;
         let quarantine = Quarantine::load(&connection)?;
+        let storage = Arc::new(Storage::watch(directory)?);
+        let files = Files {
+            reserve,
+            mark,
+            storage: storage.clone(),
+        };
         let database = Database {
-            writer: Writer::start(connection, reserve, config.queue)?,
-            readers: Readers::new(path.clone(), config.clone()),
+            writer: Writer::start(connection, files, config.queue)?,
+            readers: Readers::new(path.clone(), config.clone(), storage.clone()),
             quarantine,
         };
         Ok(Self {
             database,
             path,
+            storage,
             config: config.clone(),
-            _directory: claimed,
+            directory: claimed,
         })
     }
 
@@ -124,8 +157,9 @@ impl SqliteStore {
         config: &StoreConfig,
         target: &Path,
     ) -> Result<u64, StoreError> {
+        let least = tail::least_of_foreign_copy(directory, config)?;
         let path = directory.join(directory::DATABASE);
-        backup::write(&engine::open_reader(&path, config)?, target)
+        backup::write(&engine::open_reader(&path, config)?, target, least)
     }
 
     fn submit_insert(&self, new: NewReference) -> Result<Pending<insert::Outcome>, StoreError> {
@@ -311,13 +345,31 @@ impl MaintainPlaces for SqliteStore {
     fn verify(&self) -> Result<VerifyReport, StoreError> {
         // Damage of a map is in the report, so it is not counted a second time.
         let database = &self.database;
-        database
-            .readers
-            .with(|connection| database.verify(connection))
+        database.readers.with(|connection| {
+            let mut report = database.verify(connection)?;
+            let complaint = tail::complaint(self.directory.path(), connection);
+            report.engine_errors.extend(complaint);
+            Ok(report)
+        })
     }
 
     fn backup(&self, target: &Path) -> Result<u64, StoreError> {
-        backup::write(&engine::open_reader(&self.path, &self.config)?, target)
+        self.storage.check_names()?;
+        let least = tail::least_of_copy(self.directory.path())?;
+        backup::write(
+            &engine::open_reader(&self.path, &self.config)?,
+            target,
+            least,
+        )
+    }
+
+    fn check_storage(&self) -> Result<(), StoreError> {
+        self.storage.check()?;
+        if self.storage.has_failed() {
+            // Whether the disk takes writes again is known once it has taken one.
+            self.database.write(Effect::Shrinks, |_| Ok(()))?;
+        }
+        Ok(())
     }
 
     fn footprint(&self) -> Result<Footprint, StoreError> {

@@ -1,16 +1,21 @@
 //! A bounded pool of reading connections, opened on demand.
+//!
+//! A connection is opened by the database's name, which may stand for another database once the
+//! data directory was exchanged. Then no more are opened, and those that are open serve.
 
 use super::engine::open_reader;
+use super::storage::Storage;
 use crate::config::StoreConfig;
 use crate::error::StoreError;
 use rusqlite::Connection;
 use std::path::PathBuf;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 /// The pool. A reader waits while all of its connections are in use.
 pub(super) struct Readers {
     path: PathBuf,
     config: StoreConfig,
+    storage: Arc<Storage>,
     pool: Mutex<Pool>,
     returned: Condvar,
 }
@@ -24,10 +29,11 @@ struct Pool {
 
 impl Readers {
     /// A pool of at most `config.readers` connections to the database at `path`.
-    pub(super) fn new(path: PathBuf, config: StoreConfig) -> Self {
+    pub(super) fn new(path: PathBuf, config: StoreConfig, storage: Arc<Storage>) -> Self {
         Self {
             path,
             config,
+            storage,
             pool: Mutex::default(),
             returned: Condvar::new(),
         }
@@ -64,7 +70,8 @@ impl Readers {
                     connection: Some(connection),
                 });
             }
-            if pool.open < self.config.readers.max(1) {
+            let may_open = pool.open == 0 || self.storage.check_names().is_ok();
+            if pool.open < self.config.readers.max(1) && may_open {
                 pool.open += 1;
                 drop(pool);
                 return self.open_another();
@@ -83,7 +90,10 @@ impl Readers {
             readers: self,
             connection: None,
         };
+        self.storage.check_names()?;
         lease.connection = Some(open_reader(&self.path, &self.config)?);
+        // The name may have changed hands while the connection was opened.
+        self.storage.check_names()?;
         Ok(lease)
     }
 }

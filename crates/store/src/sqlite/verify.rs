@@ -45,7 +45,11 @@ impl Database {
                 Ok(()) => {}
                 // If the engine cannot read one map to its end, the others are still worth
                 // checking.
-                Err(error @ (StoreError::Engine { .. } | StoreError::Damaged { .. })) => {
+                Err(
+                    error @ (StoreError::Engine { .. }
+                    | StoreError::StorageLost { .. }
+                    | StoreError::Damaged { .. }),
+                ) => {
                     let message = format!("map {}: {error}", map.name);
                     report.engine_errors.push(message);
                 }

@@ -8,14 +8,23 @@
 //!
 //! On a full disk the log is folded into the database and the job tried once more; deletes may
 //! then use up the [`Reserve`], and until it can be restored jobs that grow the store are refused.
+//!
+//! Callers are answered only if, after the commit, the [`Storage`] is still in place and the
+//! [`MarkFile`] says durably that the commit was made. A commit for which that fails may be in the
+//! database or not; its callers are told that the storage is lost.
 
 use super::engine::failed;
 use super::job::{Effect, Job, Pending, job};
+use super::mark::{CommitMark, MarkFile};
 use super::purge;
 use super::reserve::Reserve;
+use super::sequence::{Progress, count_commit, set_closed};
+use super::storage::{Storage, Writing};
 use crate::crash_points;
 use crate::error::StoreError;
 use rusqlite::Connection;
+use rusqlite::config::DbConfig;
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvError, SyncSender, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
 
@@ -36,14 +45,14 @@ impl Writer {
     /// Starts the thread on `connection`. At most `queue` jobs wait; further callers block.
     pub(super) fn start(
         connection: Connection,
-        reserve: Reserve,
+        files: Files,
         queue: usize,
     ) -> Result<Self, StoreError> {
         let (jobs, waiting) = sync_channel(queue.max(1));
         let purging = purge::is_pending(&connection)?;
         let worker = Worker {
             connection,
-            reserve,
+            files,
             waiting,
             purging,
         };
@@ -94,10 +103,37 @@ impl Drop for Writer {
     }
 }
 
+/// What the writer keeps beside the database.
+pub(super) struct Files {
+    pub reserve: Reserve,
+    /// None if the database cannot say how far it has come.
+    pub mark: Option<MarkFile>,
+    pub storage: Arc<Storage>,
+}
+
+/// Why a transaction failed.
+enum Failure {
+    /// Nothing of it remains, and it may be tried again.
+    Undone(StoreError),
+    /// Nothing of it remains, and the storage is at fault, so that others would fail as well.
+    Lost(String),
+    /// It may be in the database, and nobody may be told so.
+    Unmarked(String),
+}
+
+impl From<StoreError> for Failure {
+    fn from(error: StoreError) -> Self {
+        match error {
+            StoreError::StorageLost { reason } => Self::Lost(reason),
+            error => Self::Undone(error),
+        }
+    }
+}
+
 /// The writing thread's own state.
 struct Worker {
     connection: Connection,
-    reserve: Reserve,
+    files: Files,
     waiting: Receiver<Box<dyn Job>>,
     /// Whether deleted maps or retired vectors still lie on disk.
     purging: bool,
@@ -120,7 +156,26 @@ impl Worker {
             self.purging = self.purging || group.shrinks;
             self.purge_some();
         }
+        self.close();
+    }
+
+    /// Folds the log into the database before the connection closes.
+    fn close(&self) {
+        let said = self.files.storage.begin().and_then(|_writing| {
+            set_closed(&self.connection).map_err(failed("saying that it is closed"))
+        });
+        if let Err(error) = said {
+            tracing::warn!(%error, "the database does not say that it is closed");
+        }
         self.checkpoint();
+        if let Err(error) = self.files.storage.check() {
+            tracing::error!(%error, "the log is left as it is");
+            // Closing would remove the log by its name, which may stand for another one by now.
+            let keep_log = DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE;
+            if let Err(error) = self.connection.set_db_config(keep_log, true) {
+                tracing::error!(%error, "cannot keep the log");
+            }
+        }
     }
 
     /// The next job; removes deleted data while there is none.
@@ -159,6 +214,10 @@ impl Worker {
 
     /// Makes a group durable and answers its callers.
     fn commit(&mut self, jobs: Vec<Box<dyn Job>>) {
+        // What follows may write to the directory even before a transaction begins.
+        if let Err(error) = self.files.storage.check() {
+            return refuse(jobs, &reason_of(error));
+        }
         let mut admitted = self.admit(jobs);
         if admitted.is_empty() {
             return;
@@ -169,12 +228,13 @@ impl Worker {
                     job.finish(None);
                 }
             }
-            Err(error) if admitted.len() == 1 => {
+            Err(Failure::Lost(reason) | Failure::Unmarked(reason)) => refuse(admitted, &reason),
+            Err(Failure::Undone(error)) if admitted.len() == 1 => {
                 for job in admitted {
                     self.retry(job, &error);
                 }
             }
-            Err(_) => {
+            Err(Failure::Undone(_)) => {
                 for job in admitted {
                     self.commit_alone(job);
                 }
@@ -184,7 +244,7 @@ impl Worker {
 
     /// The jobs that may run. Without the reserve those that grow the store are refused.
     fn admit(&mut self, jobs: Vec<Box<dyn Job>>) -> Vec<Box<dyn Job>> {
-        if self.reserve.is_in_place() || self.restore_reserve() {
+        if self.files.reserve.is_in_place() || self.restore_reserve() {
             return jobs;
         }
         let mut admitted = Vec::new();
@@ -200,7 +260,8 @@ impl Worker {
     fn commit_alone(&mut self, mut job: Box<dyn Job>) {
         match self.attempt(std::slice::from_mut(&mut job)) {
             Ok(()) => job.finish(None),
-            Err(error) => self.retry(job, &error),
+            Err(Failure::Lost(reason) | Failure::Unmarked(reason)) => refuse([job], &reason),
+            Err(Failure::Undone(error)) => self.retry(job, &error),
         }
     }
 
@@ -209,27 +270,83 @@ impl Worker {
         if matches!(first, StoreError::DiskFull) {
             self.make_room(job.effect());
         }
-        let outcome = self.attempt(std::slice::from_mut(&mut job));
-        job.finish(outcome.err());
+        match self.attempt(std::slice::from_mut(&mut job)) {
+            Ok(()) => job.finish(None),
+            Err(Failure::Undone(error)) => job.finish(Some(error)),
+            Err(Failure::Lost(reason) | Failure::Unmarked(reason)) => refuse([job], &reason),
+        }
         self.restore_reserve();
     }
 
+    /// Runs jobs in one transaction and marks it.
+    fn attempt(&self, jobs: &mut [Box<dyn Job>]) -> Result<(), Failure> {
+        let storage = &self.files.storage;
+        let outcome = storage.begin().map_err(Failure::from).and_then(|writing| {
+            let progress = self.transact(jobs, &writing)?;
+            crash_points::reach(crash_points::AFTER_COMMIT);
+            self.acknowledge(&writing, progress)
+        });
+        match &outcome {
+            Ok(()) => storage.wrote(Ok(())),
+            Err(Failure::Lost(reason) | Failure::Unmarked(reason)) => {
+                tracing::error!(reason, "the storage is lost");
+                storage.wrote(Err(&StoreError::StorageLost {
+                    reason: reason.clone(),
+                }));
+            }
+            Err(Failure::Undone(_)) => {}
+        }
+        outcome
+    }
+
     /// Runs jobs in one transaction. An error means that nothing of any of them remains.
-    fn attempt(&self, jobs: &mut [Box<dyn Job>]) -> Result<(), StoreError> {
+    fn transact(
+        &self,
+        jobs: &mut [Box<dyn Job>],
+        writing: &Writing<'_>,
+    ) -> Result<Option<Progress>, StoreError> {
         crash_points::reach(crash_points::BEFORE_BEGIN);
         self.execute("BEGIN IMMEDIATE")?;
         let outcome = self.run_all(jobs).and_then(|()| {
+            let progress = self.count()?;
             crash_points::reach(crash_points::BEFORE_COMMIT);
-            self.execute("COMMIT")
+            writing.check()?;
+            self.execute("COMMIT")?;
+            Ok(progress)
         });
-        if outcome.is_ok() {
-            crash_points::reach(crash_points::AFTER_COMMIT);
-        } else if !self.connection.is_autocommit()
+        if outcome.is_err()
+            && !self.connection.is_autocommit()
             && let Err(error) = self.execute("ROLLBACK")
         {
             tracing::error!(%error, "cannot roll back");
         }
         outcome
+    }
+
+    /// Counts the commit; none if damage keeps the database from counting, which must not keep
+    /// what is damaged from being deleted.
+    fn count(&self) -> Result<Option<Progress>, StoreError> {
+        match count_commit(&self.connection).map_err(failed("counting commits")) {
+            Err(error @ StoreError::Damaged { .. }) => {
+                tracing::error!(%error, "this commit is not marked");
+                Ok(None)
+            }
+            counted => counted,
+        }
+    }
+
+    /// Makes sure that what was committed will be found again, and that its loss would be noticed.
+    fn acknowledge(
+        &self,
+        writing: &Writing<'_>,
+        progress: Option<Progress>,
+    ) -> Result<(), Failure> {
+        let unmarked = |error| Failure::Unmarked(reason_of(error));
+        writing.check().map_err(unmarked)?;
+        if let (Some(mark), Some(progress)) = (&self.files.mark, progress) {
+            mark.record(&CommitMark::now(progress)).map_err(unmarked)?;
+        }
+        Ok(())
     }
 
     /// Runs every job under a savepoint, and undoes those that fail. An error means that all of
@@ -262,7 +379,7 @@ impl Worker {
     fn make_room(&mut self, effect: Effect) {
         self.checkpoint();
         if effect == Effect::Shrinks || self.purging {
-            self.reserve.release();
+            self.files.reserve.release();
             while self.purging {
                 self.purge_some();
             }
@@ -271,10 +388,10 @@ impl Worker {
     }
 
     fn restore_reserve(&mut self) -> bool {
-        if !self.reserve.is_in_place() {
+        if !self.files.reserve.is_in_place() {
             self.checkpoint();
         }
-        self.reserve.restore()
+        self.files.reserve.restore()
     }
 
     /// Removes one batch of deleted data.
@@ -282,7 +399,12 @@ impl Worker {
         if !self.purging {
             return;
         }
-        match purge::batch(&self.connection) {
+        let removed = self
+            .files
+            .storage
+            .begin()
+            .and_then(|_writing| purge::batch(&self.connection));
+        match removed {
             Ok(more) => self.purging = more,
             Err(error) => {
                 // Tried again after the next deletion or at the next start.
@@ -295,8 +417,29 @@ impl Worker {
     /// Folds the log into the database as far as readers allow, and cuts it.
     fn checkpoint(&self) {
         let sql = "PRAGMA wal_checkpoint(TRUNCATE)";
-        if let Err(error) = self.connection.query_row(sql, [], |_| Ok(())) {
+        let folded = self.files.storage.begin_folding().and_then(|_writing| {
+            let folded = self.connection.query_row(sql, [], |_| Ok(()));
+            folded.map_err(failed("folding the log into it"))
+        });
+        if let Err(error) = folded {
             tracing::warn!(%error, "cannot fold the log into the database now");
         }
+    }
+}
+
+/// What is wrong with the storage.
+fn reason_of(error: StoreError) -> String {
+    match error {
+        StoreError::StorageLost { reason } => reason,
+        other => other.to_string(),
+    }
+}
+
+/// Answers that the storage is lost.
+fn refuse(jobs: impl IntoIterator<Item = Box<dyn Job>>, reason: &str) {
+    for job in jobs {
+        job.finish(Some(StoreError::StorageLost {
+            reason: reason.to_owned(),
+        }));
     }
 }

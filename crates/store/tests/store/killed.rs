@@ -65,6 +65,18 @@ fn child_that_writes_until_it_is_killed() {
     print("\ndeleted");
 }
 
+/// The process that is killed, for other tests.
+#[cfg(feature = "crash-points")]
+pub struct Child;
+
+#[cfg(feature = "crash-points")]
+impl Child {
+    /// Runs it in `directory` with a crash point armed; what it printed.
+    pub fn run(directory: &Path, armed: &str) -> String {
+        String::from_utf8_lossy(&run_child(directory, armed).stdout).into_owned()
+    }
+}
+
 /// Runs the child in `directory` with a crash point armed.
 fn run_child(directory: &Path, armed: &str) -> Output {
     Command::new(std::env::current_exe().unwrap())
@@ -142,7 +154,7 @@ fn check_what_is_left(directory: &Path, printed: &str, point: &str) {
 }
 
 /// Every reference whose insert returned is there, with its patches.
-fn check_acknowledged(store: &SqliteStore, printed: &str, point: &str) {
+pub fn check_acknowledged(store: &SqliteStore, printed: &str, point: &str) {
     let lines = printed.lines();
     for line in lines.filter_map(|line| line.strip_prefix("stored ")) {
         let (id, seed) = line.split_once(' ').unwrap();

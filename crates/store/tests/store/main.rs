@@ -10,6 +10,8 @@ mod combined;
 mod damage;
 mod full_disk;
 mod killed;
+mod lost_storage;
+mod lost_tail;
 mod maps;
 mod opening;
 mod references;
