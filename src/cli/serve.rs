@@ -32,14 +32,19 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
     logging::init(&config.log)?;
     placeformer_kernels::self_check()?;
     let loaders = loaders(&config, Arc::new(ProgressBars::default()));
-    serve_until_signal(config, loaders, print_address)?;
+    let scheme = if config.http.has_tls() {
+        "https"
+    } else {
+        "http"
+    };
+    serve_until_signal(config, loaders, |address| print_address(scheme, address))?;
     Ok(())
 }
 
 /// Prints where the server listens.
-pub(super) fn print_address(address: SocketAddr) {
+pub(super) fn print_address(scheme: &str, address: SocketAddr) {
     // Whoever started the server may have closed the pipe already, which is no reason to stop.
-    if let Err(error) = say!("listening on http://{address}") {
+    if let Err(error) = say!("listening on {scheme}://{address}") {
         tracing::warn!(%error, %address, "the address was not printed");
     }
 }

@@ -73,7 +73,7 @@ async fn read_all(stream: &mut TcpStream) -> String {
 
 fn post(path: &str, body: &[u8]) -> Vec<u8> {
     let head = format!(
-        "POST {path} HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-type: image/png\r\ncontent-length: {}\r\n\r\n",
+        "POST {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-type: image/png\r\ncontent-length: {}\r\n\r\n",
         body.len()
     );
     [head.as_bytes(), body].concat()
@@ -119,7 +119,7 @@ async fn a_head_that_dawdles_is_cut_off() {
     let server = Server::start(|config| config.http.header_timeout_ms = 200).await;
     let mut stream = server.connect().await;
     stream
-        .write_all(b"GET /livez HTTP/1.1\r\nhost: x\r\nx-slow")
+        .write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\nx-slow")
         .await
         .unwrap();
     let answer = read_all(&mut stream).await;
@@ -129,7 +129,7 @@ async fn a_head_that_dawdles_is_cut_off() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_body_over_the_limit_is_refused_before_it_is_sent() {
     let server = Server::start(|config| config.image.max_bytes = 1000).await;
-    let head = "POST /query?map=m HTTP/1.1\r\nhost: x\r\ncontent-type: image/png\r\ncontent-length: 999999999\r\n\r\n";
+    let head = "POST /query?map=m HTTP/1.1\r\nhost: localhost\r\ncontent-type: image/png\r\ncontent-length: 999999999\r\n\r\n";
     let answer = server.exchange(head.as_bytes()).await;
     assert!(
         answer.starts_with("HTTP/1.1 413") && answer.contains("body_too_large"),
@@ -143,7 +143,7 @@ async fn a_body_of_unknown_length_is_cut_off_at_the_limit() {
     for path in ["/query?map=m", "/references?map=m"] {
         let mut stream = server.connect().await;
         let head = format!(
-            "POST {path} HTTP/1.1\r\nhost: x\r\ncontent-type: image/png\r\ntransfer-encoding: chunked\r\n\r\n"
+            "POST {path} HTTP/1.1\r\nhost: localhost\r\ncontent-type: image/png\r\ntransfer-encoding: chunked\r\n\r\n"
         );
         stream.write_all(head.as_bytes()).await.unwrap();
         // The last chunk never comes: the answer must not wait for it.
@@ -234,7 +234,7 @@ async fn stopping_lets_requests_under_way_finish() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_drain_delay_fails_readiness_first() {
     let mut server = Server::start(|config| config.http.drain_delay_ms = 1500).await;
-    let get = b"GET /readyz HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n";
+    let get = b"GET /readyz HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
     assert!(server.exchange(get).await.starts_with("HTTP/1.1 200"));
     server.stop();
     sleep(Duration::from_millis(200)).await;
@@ -290,7 +290,7 @@ async fn connections_beyond_the_bound_wait_their_turn() {
     sleep(Duration::from_millis(100)).await;
     let mut waiting = server.connect().await;
     waiting
-        .write_all(b"GET /livez HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n")
+        .write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n")
         .await
         .unwrap();
     let mut byte = [0];

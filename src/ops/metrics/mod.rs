@@ -6,7 +6,7 @@
 
 mod labels;
 
-pub use labels::{MemoryComponent, PipelineStage, Rejection};
+pub use labels::{ConnectionCut, ConnectionKind, MemoryComponent, PipelineStage, Rejection};
 
 use prometheus::core::Collector;
 use prometheus::process_collector::ProcessCollector;
@@ -63,6 +63,7 @@ pub struct Metrics {
     ready: IntGauge,
     disk_free_bytes: IntGauge,
     cache_lookups: IntCounterVec,
+    connections: ConnectionSeries,
 }
 
 impl Metrics {
@@ -114,6 +115,7 @@ impl Metrics {
                 "Key patches asked of the cache.",
                 &["result"],
             )?,
+            connections: ConnectionSeries::new(&series)?,
             registry: series.0,
         };
         metrics.start_at_zero();
@@ -137,6 +139,12 @@ impl Metrics {
             self.cache_lookups.with_label_values(&[result]);
         }
         self.references.with_label_values(&[OTHER_MAPS]);
+        for kind in ConnectionKind::ALL {
+            self.set_connections(kind, 0);
+        }
+        for reason in ConnectionCut::ALL {
+            self.connections.cut.with_label_values(&[reason.as_str()]);
+        }
     }
 
     /// Makes the series of a route appear with zeros, one for each status it documents.
@@ -255,12 +263,33 @@ impl Metrics {
             .add(other as i64);
     }
 
+    /// Connections that are open.
+    pub fn set_connections(&self, kind: ConnectionKind, open: usize) {
+        let open = i64::try_from(open).unwrap_or(i64::MAX);
+        let series = self.connections.open.with_label_values(&[kind.as_str()]);
+        series.set(open);
+    }
+
+    /// A connection was ended, or not taken.
+    pub fn connection_cut(&self, reason: ConnectionCut) {
+        let series = self.connections.cut.with_label_values(&[reason.as_str()]);
+        series.inc();
+    }
+
     /// All series in Prometheus' text format.
     ///
     /// # Errors
     /// A series cannot be written as text.
     pub fn render(&self) -> Result<String, Error> {
         TextEncoder::new().encode_to_string(&self.registry.gather())
+    }
+
+    /// Writes what [`Metrics::render`] returns.
+    ///
+    /// # Errors
+    /// A series cannot be written as text, or `writer` takes no more.
+    pub fn render_to(&self, writer: &mut impl std::io::Write) -> Result<(), Error> {
+        TextEncoder::new().encode(&self.registry.gather(), writer)
     }
 
     /// Content type of [`Metrics::render`].
@@ -310,6 +339,25 @@ impl QuerySeries {
             unmatched: series.counter(
                 "query_unmatched_total",
                 "Queries whose best answer is not trusted.",
+            )?,
+        })
+    }
+}
+
+/// Who is connected.
+struct ConnectionSeries {
+    open: IntGaugeVec,
+    cut: IntCounterVec,
+}
+
+impl ConnectionSeries {
+    fn new(series: &Series) -> Result<Self, Error> {
+        Ok(Self {
+            open: series.gauges("connections", "Connections that are open.", &["kind"])?,
+            cut: series.counters(
+                "connections_cut_total",
+                "Connections that the server ended, or did not take.",
+                &["reason"],
             )?,
         })
     }
