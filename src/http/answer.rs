@@ -130,8 +130,10 @@ impl io::Write for BudgetedWriter<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::http::config::{AuthConfig, HttpConfig};
     use crate::http::memory_budget::BufferKind;
     use crate::ops::Metrics;
+    use http_body_util::BodyExt;
     use std::io::Write;
     use std::sync::Arc;
 
@@ -159,5 +161,31 @@ mod tests {
         drop(last);
         let mut third = BudgetedWriter::new(&budget);
         third.write_all(&vec![3; 100 << 10]).unwrap();
+    }
+
+    /// Is written as whether the thread that writes it is another than this.
+    struct Writer(std::thread::ThreadId);
+
+    impl Serialize for Writer {
+        fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+            serializer.serialize_bool(std::thread::current().id() != self.0)
+        }
+    }
+
+    #[tokio::test]
+    async fn answers_are_made_and_written_off_the_thread_of_the_connections() {
+        let state = AppState::new(
+            HttpConfig::default(),
+            &AuthConfig::default(),
+            1 << 20,
+            Arc::new(Metrics::new().unwrap()),
+            Arc::default(),
+        )
+        .unwrap();
+        let here = std::thread::current().id();
+        let make = move || (std::thread::current().id() != here, Writer(here));
+        let answer = json(&state, Workload::Large, make).await.unwrap();
+        let body = answer.into_body().collect().await.unwrap().to_bytes();
+        assert_eq!(body, "[true,true]");
     }
 }

@@ -6,4 +6,5 @@ mod common;
 mod commands;
 mod eval;
 mod own_weights;
+mod serve;
 mod train;

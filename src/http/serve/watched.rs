@@ -184,3 +184,29 @@ impl AsyncWrite for WatchedStream {
         Pin::new(&mut self.stream).poll_shutdown(context)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tokio::net::TcpListener;
+
+    #[tokio::test]
+    async fn the_kernel_hides_little_and_ends_what_nobody_acknowledges() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let _client = TcpStream::connect(listener.local_addr().unwrap())
+            .await
+            .unwrap();
+        let (stream, _) = listener.accept().await.unwrap();
+        let config = HttpConfig {
+            answer_stall_timeout_ms: 2000,
+            header_timeout_ms: 7000,
+            ..HttpConfig::default()
+        };
+        let activity = Arc::new(Activity::new());
+        let watched = WatchedStream::new(stream, (&config).into(), activity).unwrap();
+        let socket = SockRef::from(&watched.stream);
+        assert_eq!(socket.tcp_notsent_lowat().unwrap(), UNSENT_BYTES);
+        let silence = socket.tcp_user_timeout().unwrap();
+        assert_eq!(silence, Some(Duration::from_secs(7)));
+    }
+}
