@@ -63,7 +63,7 @@ impl Server {
     /// Connects as a client that has little room for answers that it does not read.
     pub async fn connect_narrowly(&self) -> TcpStream {
         let socket = TcpSocket::new_v4().unwrap();
-        socket.set_recv_buffer_size(4 << 10).unwrap();
+        socket.set_recv_buffer_size(16 << 10).unwrap();
         socket.connect(self.address).await.unwrap()
     }
 
