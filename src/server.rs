@@ -5,7 +5,7 @@
 //! both are open.
 
 use crate::config::Config;
-use crate::http::{AppState, serve};
+use crate::http::{AppState, Certificate, TlsError, serve_encrypted};
 use crate::ops::{Health, Metrics, disk, shutdown};
 use crate::pipeline::{DescriptorSource, Parts, PipelineError, Service};
 use placeformer_core::progress::Progress;
@@ -19,7 +19,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, lookup_host};
 use tokio::task::spawn_blocking;
 use tokio_util::task::AbortOnDropHandle;
 
@@ -53,6 +53,19 @@ pub enum ServerError {
     /// The runtime of the asynchronous tasks cannot be made.
     #[error("the runtime cannot start")]
     Runtime(#[source] std::io::Error),
+    /// Everyone who reaches the address could read and change everything.
+    #[error(
+        "http.listen: {address} can be reached from other machines, and there are no API keys, so \
+         everyone there could read and change everything: set auth.keys, listen on 127.0.0.1, or \
+         say --insecure (http.insecure = true) if only people you trust reach it"
+    )]
+    Exposed {
+        /// The address in the settings.
+        address: String,
+    },
+    /// The certificate cannot be used.
+    #[error(transparent)]
+    Tls(#[from] TlsError),
     /// The server cannot listen on its address.
     #[error("cannot listen on {address}")]
     Listen {
@@ -160,7 +173,7 @@ pub fn serve_until_signal(
         .build()
         .map_err(ServerError::Runtime)?;
     let outcome = runtime.block_on(async {
-        let listener = listen(&config.http.listen, announce).await?;
+        let listener = listen(&config, announce).await?;
         run_server(listener, config, loaders, stop_requested()).await
     });
     // Blocking work that goes on after the drain must not keep the process alive.
@@ -170,14 +183,22 @@ pub fn serve_until_signal(
 
 /// Binds the listener and announces the address that it has.
 async fn listen(
-    address: &str,
+    config: &Config,
     announce: impl FnOnce(SocketAddr),
 ) -> Result<TcpListener, ServerError> {
+    let address = &config.http.listen;
     let failed = |source| ServerError::Listen {
         address: address.to_owned(),
         source,
     };
-    let listener = TcpListener::bind(address).await.map_err(failed)?;
+    let addresses: Vec<_> = lookup_host(address).await.map_err(failed)?.collect();
+    let is_open = config.auth.keys.is_empty() && !config.http.insecure;
+    let is_local = |address: &SocketAddr| address.ip().to_canonical().is_loopback();
+    if is_open && !addresses.iter().all(is_local) {
+        let address = address.to_owned();
+        return Err(ServerError::Exposed { address });
+    }
+    let listener = TcpListener::bind(&*addresses).await.map_err(failed)?;
     announce(listener.local_addr().map_err(failed)?);
     Ok(listener)
 }
@@ -209,10 +230,11 @@ pub async fn run_server(
         metrics,
         health,
     )?;
+    let certificate = Certificate::open(&config.http).await?;
     let watching = tokio::spawn(watch_disk(config.clone(), state.clone()));
     let _watching = AbortOnDropHandle::new(watching);
     let opening = open(state.clone(), config, loaders);
-    let serving = serve(listener, state, shutdown);
+    let serving = serve_encrypted(listener, state, certificate, shutdown);
     tokio::pin!(serving);
     // A shutdown during start-up ends the server without waiting for the model and the store.
     tokio::select! {

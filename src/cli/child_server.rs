@@ -1,6 +1,6 @@
 //! A server process that a command starts for itself, such as the demo's.
 
-use super::client::{ServerArgs, ServerClient};
+use super::client::{ServerArgs, ServerClient, TrustArgs};
 use anyhow::{Context, bail, ensure};
 use std::ffi::OsString;
 use std::fs::File;
@@ -59,6 +59,7 @@ impl ChildServer {
         let client = ServerClient::new(ServerArgs {
             server: self.url.clone(),
             api_key: None,
+            trust: TrustArgs::default(),
             timeout: 10,
         })?;
         while started.elapsed() < START_LIMIT {

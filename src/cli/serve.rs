@@ -33,15 +33,20 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
     let _flush = logging::init(&config.log)?;
     placeformer_kernels::self_check()?;
     let loaders = loaders(&config, Arc::new(ProgressBars::default()));
-    serve_until_signal(config, loaders, print_address)?;
+    let scheme = if config.http.has_tls() {
+        "https"
+    } else {
+        "http"
+    };
+    serve_until_signal(config, loaders, |address| print_address(scheme, address))?;
     Ok(())
 }
 
 /// Prints where the server listens.
-pub(super) fn print_address(address: SocketAddr) {
+pub(super) fn print_address(scheme: &'static str, address: SocketAddr) {
     // Whoever started the server may have closed the pipe already, or left it full, which is no
     // reason to stop or to wait.
-    match within_patience(move || say!("listening on http://{address}")) {
+    match within_patience(move || say!("listening on {scheme}://{address}")) {
         Some(Ok(())) => {}
         Some(Err(error)) => tracing::warn!(%error, %address, "the address was not printed"),
         None => tracing::warn!(%address, "nobody reads the address on standard output"),

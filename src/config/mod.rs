@@ -107,12 +107,14 @@ impl Config {
     fn apply(&mut self, overrides: &Overrides) {
         let Overrides {
             listen,
+            insecure,
             data,
             log_format,
             log,
             model,
         } = overrides.clone();
         set(&mut self.http.listen, listen);
+        self.http.insecure |= insecure;
         set(&mut self.data.directory, data);
         set(&mut self.log.format, log_format);
         set(&mut self.log.filter, log);

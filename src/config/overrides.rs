@@ -10,6 +10,9 @@ pub struct Overrides {
     /// Address and port to listen on; port 0 picks a free one.
     #[arg(long, value_name = "ADDR")]
     pub listen: Option<String>,
+    /// Listen on an address that other machines reach although there are no API keys.
+    #[arg(long)]
+    pub insecure: bool,
     /// Directory of the store.
     #[arg(long, value_name = "DIR")]
     pub data: Option<PathBuf>,
@@ -49,6 +52,7 @@ impl Overrides {
     pub(super) fn flag_of(&self, key: &str) -> Option<&'static str> {
         let (given, flag) = match key {
             "http.listen" => (self.listen.is_some(), "--listen"),
+            "http.insecure" => (self.insecure, "--insecure"),
             "data.directory" => (self.data.is_some(), "--data"),
             "log.format" => (self.log_format.is_some(), "--log-format"),
             "log.filter" => (self.log.is_some(), "--log"),

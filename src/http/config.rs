@@ -1,7 +1,10 @@
 //! Settings of the web surface.
 
+use super::cross_origin::CrossOriginRules;
 use placeformer_core::types::InvalidValue;
 use serde::{Deserialize, Serialize};
+use std::net::IpAddr;
+use std::path::PathBuf;
 use utoipa::ToSchema;
 
 /// Limits and timeouts of connections and bodies. The comments of the fields are printed as the
@@ -9,10 +12,45 @@ use utoipa::ToSchema;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct HttpConfig {
-    /// Address and port to listen on; port 0 picks a free one.
+    /// Address and port to listen on; port 0 picks a free one. Without API keys it must be a
+    /// loopback address, unless `insecure` is true.
     pub listen: String,
-    /// Connections open at once; further ones wait in the kernel's backlog.
+    /// Lets a service without API keys listen on an address that other machines reach: whoever
+    /// reaches it can then read and change everything.
+    pub insecure: bool,
+    /// Names by which clients may address the server (the header Host), without a port. Empty: any
+    /// name, except on a loopback address without API keys, where only localhost and loopback
+    /// addresses are answered, so that no web page can reach the service through a name of its
+    /// own. Those are always allowed.
+    pub allowed_hosts: Vec<String>,
+    /// Origins of web pages that may use the service from a browser, such as
+    /// "https://console.example.com". Pages of other origins than the service's own are refused.
+    pub allowed_origins: Vec<String>,
+    /// File of the certificate chain (PEM) for HTTPS, together with tls_key; plain HTTP without. Both
+    /// are read again on SIGHUP and when they change; broken files leave the old in force.
+    #[schema(value_type = Option<String>)]
+    pub tls_cert: Option<PathBuf>,
+    /// File of the certificate's private key (PEM).
+    #[schema(value_type = Option<String>)]
+    pub tls_key: Option<PathBuf>,
+    /// Connections open at once. A further client takes the place of the idlest connection of the
+    /// address that has most; if none is idle, it gets one of reserved_connections.
     pub max_connections: usize,
+    /// Connections open at once from one address; of IPv6, from one network of 64 bits. A further
+    /// one takes the place of the address's idlest, or gets one of reserved_connections.
+    pub max_connections_per_address: usize,
+    /// Addresses of proxies, behind which there are many clients, so that
+    /// max_connections_per_address does not hold for them.
+    #[schema(value_type = Vec<String>)]
+    pub trusted_proxies: Vec<IpAddr>,
+    /// Connections beyond max_connections that only get /livez, /readyz and /metrics, and 503
+    /// overloaded for everything else.
+    pub reserved_connections: usize,
+    /// Time that a connection may take to send its first byte while more than three quarters of
+    /// max_connections are open, in milliseconds; otherwise header_timeout_ms holds.
+    pub crowded_silence_ms: u64,
+    /// Age at which a connection is closed after the answer under way, in milliseconds.
+    pub max_connection_age_ms: u64,
     /// Time for a request's head to arrive, also between two requests of one connection, in
     /// milliseconds.
     pub header_timeout_ms: u64,
@@ -20,11 +58,23 @@ pub struct HttpConfig {
     pub body_timeout_ms: u64,
     /// Longest pause within a body, in milliseconds.
     pub body_idle_timeout_ms: u64,
+    /// Slowest average rate of a body in bytes a second, once body_idle_timeout_ms have passed.
+    pub min_body_bytes_per_second: u64,
+    /// Time in which a client must take min_answer_bytes_per_second of an answer that waits for it,
+    /// in milliseconds; one that takes less, or nothing, is cut off.
+    pub answer_stall_timeout_ms: u64,
+    /// Slowest rate in bytes a second at which a client may take an answer that waits for it.
+    pub min_answer_bytes_per_second: u64,
     /// Largest head of a request in bytes, at least 8192.
     pub max_header_bytes: usize,
     /// Bytes of bodies kept in memory at once over all requests; beyond, a request is answered 503
     /// overloaded.
     pub max_buffered_bytes: usize,
+    /// Bytes of answers kept in memory at once, from their making until their clients have taken
+    /// them; beyond, a request is answered 503 overloaded.
+    pub max_unsent_bytes: usize,
+    /// Bodies taken apart, and answers written as JSON, at the same time, each on a thread.
+    pub codec_threads: usize,
     /// Most references in one page of a listing.
     pub max_page: usize,
     /// After SIGTERM: time between failing /readyz and refusing connections, in milliseconds, so
@@ -38,12 +88,27 @@ impl Default for HttpConfig {
     fn default() -> Self {
         Self {
             listen: "127.0.0.1:8080".into(),
+            insecure: false,
+            allowed_hosts: Vec::new(),
+            allowed_origins: Vec::new(),
+            tls_cert: None,
+            tls_key: None,
             max_connections: 1024,
+            max_connections_per_address: 256,
+            trusted_proxies: Vec::new(),
+            reserved_connections: 16,
+            crowded_silence_ms: 2_000,
+            max_connection_age_ms: 3_600_000,
             header_timeout_ms: 15_000,
             body_timeout_ms: 30_000,
             body_idle_timeout_ms: 10_000,
+            min_body_bytes_per_second: 4 << 10,
+            answer_stall_timeout_ms: 10_000,
+            min_answer_bytes_per_second: 8 << 10,
             max_header_bytes: 32 << 10,
             max_buffered_bytes: 512 << 20,
+            max_unsent_bytes: 128 << 20,
+            codec_threads: 2,
             max_page: 1000,
             drain_delay_ms: 0,
             drain_timeout_ms: 20_000,
@@ -56,10 +121,23 @@ impl HttpConfig {
     pub fn check(&self) -> Result<(), InvalidValue> {
         let positive = [
             ("http.max_connections", self.max_connections as u64),
+            (
+                "http.max_connections_per_address",
+                self.max_connections_per_address as u64,
+            ),
+            (
+                "http.reserved_connections",
+                self.reserved_connections as u64,
+            ),
+            ("http.crowded_silence_ms", self.crowded_silence_ms),
+            ("http.max_connection_age_ms", self.max_connection_age_ms),
             ("http.header_timeout_ms", self.header_timeout_ms),
             ("http.body_timeout_ms", self.body_timeout_ms),
             ("http.body_idle_timeout_ms", self.body_idle_timeout_ms),
+            ("http.answer_stall_timeout_ms", self.answer_stall_timeout_ms),
             ("http.max_buffered_bytes", self.max_buffered_bytes as u64),
+            ("http.max_unsent_bytes", self.max_unsent_bytes as u64),
+            ("http.codec_threads", self.codec_threads as u64),
             ("http.max_page", self.max_page as u64),
         ];
         if let Some((field, _)) = positive.iter().find(|(_, value)| *value == 0) {
@@ -71,7 +149,19 @@ impl HttpConfig {
                 "use at least 8192",
             ));
         }
+        if self.tls_cert.is_some() != self.tls_key.is_some() {
+            return Err(InvalidValue::new(
+                "http.tls_cert",
+                "http.tls_cert and http.tls_key belong together: set both or neither",
+            ));
+        }
+        CrossOriginRules::new(self)?;
         Ok(())
+    }
+
+    /// Whether the server speaks HTTPS.
+    pub fn has_tls(&self) -> bool {
+        self.tls_cert.is_some()
     }
 }
 

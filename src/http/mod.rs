@@ -12,25 +12,33 @@
 //!
 //! 1. [`observe`] gives it an id and a span, and afterwards measures and logs its answer;
 //! 2. a net turns a panic into an answer ([`router`]);
-//! 3. [`authorise`] checks its key ([`api_keys`]) and the rate of its caller ([`rate_limits`]);
-//! 4. the handler ([`routes`]) reads the body within its bounds ([`body`], [`body_budget`]) and
-//!    calls the pipeline.
+//! 3. [`reserved`] lets only probes through if it came over a connection that is kept for them;
+//! 4. [`cross_origin`] refuses it if a browser sent it for a foreign web page;
+//! 5. [`authorise`] checks its key ([`api_keys`]) and the rate of its caller ([`rate_limits`]);
+//! 6. the handler ([`routes`]) reads the body within its bounds ([`body`], [`memory_budget`]) and
+//!    calls the pipeline. Bodies are taken apart, and answers written as JSON ([`answer`]), on
+//!    threads of their own ([`codec`]), so that no large one holds up the others.
 //!
 //! Every failure leaves as `application/problem+json` ([`problem`]).
 //!
 //! The server answers `/livez` and `/readyz` from its first moment. Everything that needs the
 //! pipeline answers `not_ready` until start-up puts the service into the state ([`state`]).
 
+pub mod answer;
 pub mod api_keys;
 pub mod authorise;
 pub mod body;
-pub mod body_budget;
+pub mod codec;
 pub mod config;
+pub mod connection_info;
+pub mod cross_origin;
 mod examples;
+pub mod memory_budget;
 pub mod observe;
 pub mod openapi;
 pub mod problem;
 pub mod rate_limits;
+pub mod reserved;
 pub mod route;
 pub mod router;
 pub mod routes;
@@ -39,5 +47,6 @@ pub mod state;
 
 pub use config::{ApiKey, AuthConfig, HttpConfig, Role};
 pub use router::app;
-pub use serve::serve;
+pub use serve::tls::{Certificate, TlsError};
+pub use serve::{serve, serve_encrypted};
 pub use state::AppState;

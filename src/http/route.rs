@@ -114,6 +114,9 @@ const PIPELINE_ERRORS: &[ErrorCode] = &[
     ErrorCode::StorageLost,
 ];
 
+/// What foreign web pages are answered, unless all they learn is how the service is.
+const FOREIGN_PAGE_ERRORS: &[ErrorCode] = &[ErrorCode::HostNotAllowed, ErrorCode::CrossOrigin];
+
 /// What the layers around every handler answer: the end of draining, and the net for panics.
 const LAYER_ERRORS: &[ErrorCode] = &[ErrorCode::ShuttingDown, ErrorCode::Internal];
 
@@ -127,9 +130,12 @@ impl Route {
             RequestBody::Images(_) => &[BODY_ERRORS, IMAGE_ERRORS],
         };
         let scope_errors: &[&[ErrorCode]] = match self.scope {
+            // On a connection that is reserved for probes.
+            Scope::Public if !self.is_health() => &[&[ErrorCode::Overloaded], FOREIGN_PAGE_ERRORS],
             Scope::Public => &[],
-            Scope::Metrics => &[KEY_ERRORS],
-            Scope::Key(_) => &[KEY_ERRORS, PIPELINE_ERRORS],
+            // Where too much of other answers waits to be taken.
+            Scope::Metrics => &[KEY_ERRORS, &[ErrorCode::Overloaded], FOREIGN_PAGE_ERRORS],
+            Scope::Key(_) => &[KEY_ERRORS, PIPELINE_ERRORS, FOREIGN_PAGE_ERRORS],
         };
         let mut codes = body_errors.concat();
         codes.extend(self.own_errors);
@@ -138,6 +144,11 @@ impl Route {
         // A stable sort: codes of one status stay in the order of the groups.
         codes.sort_by_key(|code| code.status());
         codes
+    }
+
+    /// Whether it says no more than how the service is, so that anyone may ask, from anywhere.
+    pub fn is_health(&self) -> bool {
+        self.scope == Scope::Public && self.access_log == AccessLog::Quiet
     }
 
     /// The handler under its method, for the router.

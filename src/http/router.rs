@@ -4,13 +4,14 @@ use super::problem::ApiError;
 use super::routes::ROUTES;
 use super::routes::docs::DocumentText;
 use super::state::AppState;
-use super::{authorise, observe, openapi};
+use super::{authorise, cross_origin, observe, openapi, reserved};
 use axum::extract::DefaultBodyLimit;
 use axum::middleware::from_fn_with_state;
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Router};
 use placeformer_core::error::ErrorCode;
 use std::any::Any;
+use tower::util::option_layer;
 use tower_http::catch_panic::CatchPanicLayer;
 
 /// The surface over `state`, complete with its layers.
@@ -26,6 +27,12 @@ pub fn app(state: AppState) -> Router {
         .layer(Extension(DocumentText(openapi::document_text())))
         .layer(DefaultBodyLimit::disable())
         .layer(from_fn_with_state(state.clone(), authorise::authorise))
+        .layer(option_layer(state.cross_origin.cors()))
+        .layer(from_fn_with_state(
+            state.clone(),
+            cross_origin::refuse_foreign_pages,
+        ))
+        .layer(from_fn_with_state(state.clone(), reserved::keep_for_probes))
         .layer(CatchPanicLayer::custom(answer_panic))
         .layer(from_fn_with_state(state.clone(), observe::observe))
         .with_state(state)

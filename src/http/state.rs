@@ -1,8 +1,10 @@
 //! What all handlers share.
 
 use super::api_keys::ApiKeys;
-use super::body_budget::BodyBudget;
+use super::codec::CodecThreads;
 use super::config::{AuthConfig, HttpConfig};
+use super::cross_origin::CrossOriginRules;
+use super::memory_budget::{BufferKind, MemoryBudget};
 use super::problem::ApiError;
 use super::rate_limits::RateLimits;
 use crate::ops::metrics::Rejection;
@@ -13,6 +15,9 @@ use placeformer_core::types::InvalidValue;
 use std::ops::Deref;
 use std::sync::{Arc, OnceLock};
 use tokio_util::sync::CancellationToken;
+
+/// Bytes of answers of `/metrics` kept in memory at once, some hundred of them.
+const MAX_UNSENT_METRICS_BYTES: usize = 16 << 20;
 
 /// What every handler shares; cheap to clone.
 #[derive(Clone)]
@@ -31,7 +36,15 @@ pub struct SharedState {
     /// How many requests a second each caller may send.
     pub rate_limits: RateLimits,
     /// How much memory the bodies of all requests may take together.
-    pub body_budget: BodyBudget,
+    pub body_budget: MemoryBudget,
+    /// How much memory answers may take together until their clients have taken them.
+    pub answer_budget: MemoryBudget,
+    /// The same for the answers of `/metrics`, which have to come through when others do not.
+    pub metrics_budget: MemoryBudget,
+    /// Where bodies are taken apart and answers are written.
+    pub codec: CodecThreads,
+    /// Which names and web pages may be used.
+    pub cross_origin: CrossOriginRules,
     /// Measurements, shared with the pipeline.
     pub metrics: Arc<Metrics>,
     /// Readiness, shared with the pipeline.
@@ -62,12 +75,17 @@ impl AppState {
         health: Arc<Health>,
     ) -> Result<Self, InvalidValue> {
         http.check()?;
+        let budget = |kind, bytes| MemoryBudget::new(kind, bytes, metrics.clone());
         let shared = SharedState {
             service: OnceLock::new(),
             max_image_bytes,
             api_keys: ApiKeys::new(auth)?,
             rate_limits: RateLimits::new(auth, metrics.clone()),
-            body_budget: BodyBudget::new(http.max_buffered_bytes, metrics.clone()),
+            body_budget: budget(BufferKind::Bodies, http.max_buffered_bytes),
+            answer_budget: budget(BufferKind::Answers, http.max_unsent_bytes),
+            metrics_budget: budget(BufferKind::Answers, MAX_UNSENT_METRICS_BYTES),
+            codec: CodecThreads::new(http.codec_threads),
+            cross_origin: CrossOriginRules::new(&http)?,
             http,
             metrics,
             health,

@@ -6,5 +6,6 @@ mod common;
 mod commands;
 mod eval;
 mod own_weights;
+mod serve;
 mod streams;
 mod train;

@@ -1,83 +1,11 @@
 //! What only a real connection shows: dawdlers, leavers, and the end of the server.
 
-use crate::support::{FakeSource, PATIENCE, open, picture};
-use placeformer::config::Config;
-use placeformer::http::serve;
-use std::net::SocketAddr;
-use std::sync::Arc;
+use crate::listener::{Server, post, read_all};
+use crate::support::{PATIENCE, picture};
 use std::time::Duration;
-use tempfile::TempDir;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::oneshot;
-use tokio::task::JoinHandle;
+use tokio::net::TcpStream;
 use tokio::time::{sleep, timeout};
-
-struct Server {
-    address: SocketAddr,
-    source: Arc<FakeSource>,
-    state: placeformer::http::AppState,
-    stop: Option<oneshot::Sender<()>>,
-    serving: JoinHandle<()>,
-    _directory: TempDir,
-}
-
-impl Server {
-    async fn start(change: impl FnOnce(&mut Config)) -> Self {
-        let (directory, source) = (tempfile::tempdir().unwrap(), FakeSource::new("fake-1"));
-        let mut config = Config::default();
-        config.store.reserve_bytes = 1 << 20;
-        change(&mut config);
-        let (state, service) = open(directory.path(), source.clone(), config);
-        state.open(service);
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let address = listener.local_addr().unwrap();
-        let (stop, stopped) = oneshot::channel();
-        let serving = tokio::spawn(serve(listener, state.clone(), async {
-            let _ = stopped.await;
-        }));
-        Self {
-            address,
-            source,
-            state,
-            stop: Some(stop),
-            serving,
-            _directory: directory,
-        }
-    }
-
-    async fn connect(&self) -> TcpStream {
-        TcpStream::connect(self.address).await.unwrap()
-    }
-
-    /// Sends a whole request and reads to the end of the connection.
-    async fn exchange(&self, request: &[u8]) -> String {
-        let mut stream = self.connect().await;
-        stream.write_all(request).await.unwrap();
-        read_all(&mut stream).await
-    }
-
-    fn stop(&mut self) {
-        self.stop.take().unwrap().send(()).unwrap();
-    }
-}
-
-async fn read_all(stream: &mut TcpStream) -> String {
-    let mut text = Vec::new();
-    // A reset after the answer is as good an end as any.
-    let _ = timeout(PATIENCE, stream.read_to_end(&mut text))
-        .await
-        .expect("the server kept the connection");
-    String::from_utf8_lossy(&text).into_owned()
-}
-
-fn post(path: &str, body: &[u8]) -> Vec<u8> {
-    let head = format!(
-        "POST {path} HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-type: image/png\r\ncontent-length: {}\r\n\r\n",
-        body.len()
-    );
-    [head.as_bytes(), body].concat()
-}
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_body_that_dawdles_is_cut_off() {
@@ -119,7 +47,7 @@ async fn a_head_that_dawdles_is_cut_off() {
     let server = Server::start(|config| config.http.header_timeout_ms = 200).await;
     let mut stream = server.connect().await;
     stream
-        .write_all(b"GET /livez HTTP/1.1\r\nhost: x\r\nx-slow")
+        .write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\nx-slow")
         .await
         .unwrap();
     let answer = read_all(&mut stream).await;
@@ -129,7 +57,7 @@ async fn a_head_that_dawdles_is_cut_off() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_body_over_the_limit_is_refused_before_it_is_sent() {
     let server = Server::start(|config| config.image.max_bytes = 1000).await;
-    let head = "POST /query?map=m HTTP/1.1\r\nhost: x\r\ncontent-type: image/png\r\ncontent-length: 999999999\r\n\r\n";
+    let head = "POST /query?map=m HTTP/1.1\r\nhost: localhost\r\ncontent-type: image/png\r\ncontent-length: 999999999\r\n\r\n";
     let answer = server.exchange(head.as_bytes()).await;
     assert!(
         answer.starts_with("HTTP/1.1 413") && answer.contains("body_too_large"),
@@ -143,7 +71,7 @@ async fn a_body_of_unknown_length_is_cut_off_at_the_limit() {
     for path in ["/query?map=m", "/references?map=m"] {
         let mut stream = server.connect().await;
         let head = format!(
-            "POST {path} HTTP/1.1\r\nhost: x\r\ncontent-type: image/png\r\ntransfer-encoding: chunked\r\n\r\n"
+            "POST {path} HTTP/1.1\r\nhost: localhost\r\ncontent-type: image/png\r\ntransfer-encoding: chunked\r\n\r\n"
         );
         stream.write_all(head.as_bytes()).await.unwrap();
         // The last chunk never comes: the answer must not wait for it.
@@ -234,7 +162,7 @@ async fn stopping_lets_requests_under_way_finish() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_drain_delay_fails_readiness_first() {
     let mut server = Server::start(|config| config.http.drain_delay_ms = 1500).await;
-    let get = b"GET /readyz HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n";
+    let get = b"GET /readyz HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
     assert!(server.exchange(get).await.starts_with("HTTP/1.1 200"));
     server.stop();
     sleep(Duration::from_millis(200)).await;
@@ -281,25 +209,4 @@ async fn the_drain_deadline_answers_what_is_left() {
         .await
         .unwrap()
         .unwrap();
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn connections_beyond_the_bound_wait_their_turn() {
-    let server = Server::start(|config| config.http.max_connections = 1).await;
-    let holder = server.connect().await;
-    sleep(Duration::from_millis(100)).await;
-    let mut waiting = server.connect().await;
-    waiting
-        .write_all(b"GET /livez HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n")
-        .await
-        .unwrap();
-    let mut byte = [0];
-    assert!(
-        timeout(Duration::from_millis(300), waiting.read(&mut byte))
-            .await
-            .is_err()
-    );
-    drop(holder);
-    assert!(read_all(&mut waiting).await.contains("200 OK"));
-    assert!(server.state.health.unready().is_none());
 }

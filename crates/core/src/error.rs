@@ -74,6 +74,12 @@ error_codes! {
     /// The credentials do not allow this.
     Forbidden = "forbidden", 403, false, None,
         "These credentials do not allow this";
+    /// The request is addressed to a name that is not the server's.
+    HostNotAllowed = "host_not_allowed", 403, false, None,
+        "The server is not to be used under this name";
+    /// A browser sent the request for a web page of another origin.
+    CrossOrigin = "cross_origin", 403, false, None,
+        "Web pages of this origin may not use the server";
     /// No such route.
     RouteNotFound = "route_not_found", 404, false, None,
         "There is nothing at this path";

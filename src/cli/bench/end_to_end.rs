@@ -154,7 +154,7 @@ pub(super) fn serve_filled(
             )?))
         }),
     };
-    serve_until_signal(config, loaders, print_address)?;
+    serve_until_signal(config, loaders, |address| print_address("http", address))?;
     Ok(())
 }
 

@@ -1,8 +1,9 @@
 //! Address, API key and time-out of a server.
 
-use super::{Answer, ClientError};
+use super::{Answer, ClientError, TrustArgs};
 use reqwest::header::RETRY_AFTER;
-use reqwest::{Client, Method, RequestBuilder};
+use reqwest::{Certificate, Client, Method, RequestBuilder};
+use std::path::Path;
 use std::time::Duration;
 
 /// How requests reach a server. Connections are kept open and shared.
@@ -14,19 +15,22 @@ pub(in crate::cli) struct Connection {
 }
 
 impl Connection {
-    /// Prepares a connection; nothing is sent yet. `timeout` bounds one request with its answer.
+    /// Prepares a connection; nothing is sent yet. `trust` says whose certificates are
+    /// trusted beside those of the system. `timeout` bounds one request with its answer.
     ///
     /// # Errors
-    /// The system refuses what the client needs.
+    /// The certificate cannot be read, or the system refuses what the client needs.
     pub(in crate::cli) fn new(
         server: &str,
         api_key: Option<String>,
+        trust: TrustArgs,
         timeout: Duration,
     ) -> Result<Self, ClientError> {
-        let client = Client::builder()
-            .timeout(timeout)
-            .build()
-            .map_err(ClientError::Client)?;
+        let mut client = Client::builder().timeout(timeout);
+        if let Some(path) = trust.ca_cert {
+            client = client.tls_certs_merge(read_certificates(&path)?);
+        }
+        let client = client.build().map_err(ClientError::Client)?;
         Ok(Self {
             client,
             base: server.trim_end_matches('/').to_owned(),
@@ -71,4 +75,18 @@ impl Connection {
             }),
         }
     }
+}
+
+/// The certificates in a file of PEM, of which there must be one at least.
+fn read_certificates(path: &Path) -> Result<Vec<Certificate>, ClientError> {
+    let bytes = std::fs::read(path).map_err(|source| ClientError::ReadFile {
+        path: path.to_owned(),
+        source,
+    })?;
+    let certificates = Certificate::from_pem_bundle(&bytes).unwrap_or_default();
+    if certificates.is_empty() {
+        let path = path.to_owned();
+        return Err(ClientError::NoCertificate { path });
+    }
+    Ok(certificates)
 }

@@ -28,6 +28,12 @@ pub(in crate::cli) enum ClientError {
         /// What the system said.
         source: io::Error,
     },
+    /// A file that should hold a certificate holds none.
+    #[error("there is no certificate (PEM) in {}", path.display())]
+    NoCertificate {
+        /// The file.
+        path: PathBuf,
+    },
     /// No answer came.
     #[error("cannot reach the server at {server} (is it running?)")]
     Unreachable {
@@ -58,7 +64,10 @@ impl ClientError {
                 after: retry_after.as_deref().and_then(parse_retry_after),
             },
             Self::Refused(problem) => problem.retry(),
-            Self::Client(_) | Self::Runtime(_) | Self::ReadFile { .. } => Retry::Never,
+            Self::Client(_)
+            | Self::Runtime(_)
+            | Self::ReadFile { .. }
+            | Self::NoCertificate { .. } => Retry::Never,
         }
     }
 

@@ -20,7 +20,7 @@ use reqwest::{Method, RequestBuilder};
 #[cfg(feature = "lab")]
 use serde::Serialize;
 use serde_json::Value;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tokio::runtime::Runtime;
 
@@ -51,9 +51,20 @@ pub struct ServerArgs {
         value_name = "KEY"
     )]
     pub api_key: Option<String>,
+    /// Whose certificates are trusted.
+    #[command(flatten)]
+    pub trust: TrustArgs,
     /// Seconds to wait for an answer.
     #[arg(long, default_value_t = 60, value_name = "SECONDS")]
     pub timeout: u64,
+}
+
+/// Whose certificates are trusted over HTTPS.
+#[derive(Debug, Clone, Default, clap::Args)]
+pub struct TrustArgs {
+    /// Certificate (PEM) that the server's is signed by, beside those that the system trusts.
+    #[arg(long, env = "PLACEFORMER_CA_CERT", value_name = "FILE")]
+    pub ca_cert: Option<PathBuf>,
 }
 
 /// Sends one request after the other and blocks until each is answered. Several threads may share
@@ -88,7 +99,7 @@ impl ServerClient {
     /// The system refuses what the client needs, such as a thread.
     pub(super) fn with_attempts(args: ServerArgs, attempts: u32) -> Result<Self, ClientError> {
         let timeout = Duration::from_secs(args.timeout);
-        let connection = Connection::new(&args.server, args.api_key, timeout)?;
+        let connection = Connection::new(&args.server, args.api_key, args.trust, timeout)?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()

@@ -7,7 +7,7 @@
 
 mod report;
 
-use super::client::{ServerArgs, ServerClient};
+use super::client::{ServerArgs, ServerClient, TrustArgs};
 use crate::cli::child_server::ChildServer;
 use crate::cli::output::say;
 use crate::cli::progress::ProgressBars;
@@ -65,6 +65,7 @@ pub fn run(args: DemoArgs) -> anyhow::Result<()> {
     let client = ServerClient::new(ServerArgs {
         server: server.url().into(),
         api_key: None,
+        trust: TrustArgs::default(),
         timeout: 60,
     })?;
     let truth = read_truth(&town.join("ground_truth.csv"))?;

@@ -13,7 +13,7 @@ mod server_sink;
 mod sink;
 mod store_sink;
 
-use crate::cli::client::ServerArgs;
+use crate::cli::client::{ServerArgs, TrustArgs};
 use crate::cli::output::{note, say};
 use crate::cli::progress::ProgressBars;
 use crate::config::ModelOverrides;
@@ -60,6 +60,8 @@ pub struct ImportArgs {
         value_name = "KEY"
     )]
     api_key: Option<String>,
+    #[command(flatten)]
+    trust: TrustArgs,
     /// CSV with the columns file, and any of lat and lon, heading, captured_at (RFC 3339).
     #[arg(long, value_name = "CSV")]
     positions: Option<PathBuf>,
@@ -157,6 +159,7 @@ fn open_sink(args: &ImportArgs) -> anyhow::Result<Box<dyn Sink>> {
         let server = ServerArgs {
             server: server.clone(),
             api_key: args.api_key.clone(),
+            trust: args.trust.clone(),
             timeout: args.timeout,
         };
         return Ok(Box::new(ServerSink::new(server, args.attempts)?));

@@ -143,6 +143,7 @@ fn parameters(upload: &Upload) -> Vec<(&'static str, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::client::TrustArgs;
     use placeformer_core::types::{GeoPoint, ReferenceFields};
     use std::io::{BufRead, BufReader, Read, Write};
     use std::net::{TcpListener, TcpStream};
@@ -198,6 +199,7 @@ mod tests {
         let args = ServerArgs {
             server,
             api_key: None,
+            trust: TrustArgs::default(),
             timeout: 10,
         };
         ServerSink::new(args, attempts).unwrap()

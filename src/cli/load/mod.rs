@@ -10,6 +10,7 @@ mod drive;
 mod report;
 mod target;
 
+use crate::cli::client::TrustArgs;
 use crate::cli::output::say;
 use anyhow::{Context, ensure};
 use bounds::Bounds;
@@ -62,6 +63,8 @@ pub struct LoadArgs {
     /// API key, sent as a bearer token.
     #[arg(long, env = "PLACEFORMER_API_KEY", hide_env_values = true)]
     api_key: Option<String>,
+    #[command(flatten)]
+    trust: TrustArgs,
     /// Most requests under way at once; beyond it a due request is counted as not sent.
     #[arg(long, default_value_t = 4096)]
     max_in_flight: usize,
@@ -82,6 +85,7 @@ pub fn run(args: LoadArgs) -> anyhow::Result<()> {
         &args.map,
         &args.options,
         args.api_key.clone(),
+        args.trust.clone(),
         images,
     )?;
     let runtime = tokio::runtime::Builder::new_multi_thread()

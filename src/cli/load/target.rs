@@ -1,6 +1,6 @@
 //! The server under load: one request and what became of it, and the server's memory meanwhile.
 
-use crate::cli::client::{Answer, BYTES, ClientError, Connection, resident_bytes};
+use crate::cli::client::{Answer, BYTES, ClientError, Connection, TrustArgs, resident_bytes};
 use anyhow::{Context, ensure};
 use bytes::Bytes;
 use reqwest::header::CONTENT_TYPE;
@@ -44,10 +44,11 @@ impl Target {
         map: &str,
         options: &str,
         api_key: Option<String>,
+        trust: TrustArgs,
         images: Vec<Bytes>,
     ) -> anyhow::Result<Self> {
         Ok(Self {
-            connection: Connection::new(server, api_key, TIMEOUT)?,
+            connection: Connection::new(server, api_key, trust, TIMEOUT)?,
             query: query_path(server, map, options)?,
             images,
             memory: Mutex::default(),

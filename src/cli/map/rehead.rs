@@ -1,6 +1,6 @@
 //! Give maps another head, through a running server or in the data directory of a stopped one.
 
-use crate::cli::client::{ServerArgs, ServerClient};
+use crate::cli::client::{ServerArgs, ServerClient, TrustArgs};
 use crate::cli::output::say;
 use crate::cli::progress::ProgressBars;
 use crate::config::{Config, Overrides};
@@ -45,6 +45,8 @@ pub(super) struct ReheadArgs {
         value_name = "KEY"
     )]
     api_key: Option<String>,
+    #[command(flatten)]
+    trust: TrustArgs,
     /// Seconds to wait for one map. A server that is no longer waited for goes on all the same.
     #[arg(long, default_value_t = 3600, value_name = "SECONDS")]
     timeout: u64,
@@ -78,6 +80,7 @@ pub(super) fn run(args: ReheadArgs) -> anyhow::Result<()> {
             let client = ServerClient::new(ServerArgs {
                 server,
                 api_key: args.api_key,
+                trust: args.trust,
                 timeout: args.timeout,
             })?;
             through_server(&client, &args.maps, head.as_ref())

@@ -6,7 +6,7 @@
 
 use super::parts::{BodyParts, MAX_PARAMETER_BYTES, json_error, parameters_too_long};
 use super::receive::ReceivedBody;
-use crate::http::body_budget::Reservation;
+use crate::http::memory_budget::Reservation;
 use crate::http::problem::ApiError;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;

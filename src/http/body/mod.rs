@@ -4,8 +4,10 @@
 //! multipart, with parameters in a part named `json` or in the query string; as JSON with the image
 //! in base64 beside the parameters.
 //!
+//! Taking a body apart is work, which is done on threads of its own ([`codec`](super::codec)).
+//!
 //! Whatever memory a body takes is reserved in one budget first
-//! ([`body_budget`](super::body_budget)): the buffer it arrives in, and the images copied or decoded
+//! ([`memory_budget`](super::memory_budget)): the buffer it arrives in, and the images copied or decoded
 //! out of it. The images then carry their reservation along, so that it is given back when the
 //! pipeline is done with them, also when the client has left meanwhile.
 
@@ -14,7 +16,8 @@ mod multipart;
 mod parts;
 mod receive;
 
-use super::body_budget::Reservation;
+use super::codec::Workload;
+use super::memory_budget::Reservation;
 use super::problem::ApiError;
 use super::state::AppState;
 use axum::extract::{Query, Request};
@@ -84,7 +87,7 @@ impl<P> UploadedImages<P> {
 ///
 /// # Errors
 /// Every code of a body, as [`Route::error_codes`](super::route::Route::error_codes) lists them.
-pub async fn read_upload<P: DeserializeOwned>(
+pub async fn read_upload<P: DeserializeOwned + Send + 'static>(
     state: &AppState,
     request: Request,
     upload: &ImageUpload,
@@ -97,14 +100,22 @@ pub async fn read_upload<P: DeserializeOwned>(
         Some("multipart/form-data") => {
             let headers = request.headers().clone();
             let received = receive(state, request, image_bytes + MAX_PARAMETER_BYTES).await?;
-            let (parts, reservation) = split_multipart(headers, received, names).await?;
-            hand_over(parts, reservation, &uri)
+            let workload = Workload::of_body(received.bytes.len());
+            let split = move || {
+                let (parts, reservation) = split_multipart(headers, received, names)?;
+                hand_over(parts, reservation, &uri)
+            };
+            state.codec.run(workload, split).await
         }
         Some("application/json") => {
             let base64_bytes = image_bytes / 3 * 4;
             let received = receive(state, request, base64_bytes + MAX_PARAMETER_BYTES).await?;
-            let (parts, reservation) = split_json(received, names)?;
-            hand_over(parts, reservation, &uri)
+            let workload = Workload::of_body(received.bytes.len());
+            let split = move || {
+                let (parts, reservation) = split_json(received, names)?;
+                hand_over(parts, reservation, &uri)
+            };
+            state.codec.run(workload, split).await
         }
         Some("image/jpeg" | "image/png" | "image/webp" | "application/octet-stream") => {
             let params = parameters_of(&uri, None)?;
@@ -125,7 +136,7 @@ pub async fn read_upload<P: DeserializeOwned>(
 ///
 /// # Errors
 /// The codes of a body without those of images.
-pub async fn read_json<T: DeserializeOwned>(
+pub async fn read_json<T: DeserializeOwned + Send + 'static>(
     state: &AppState,
     request: Request,
 ) -> Result<T, ApiError> {
@@ -136,11 +147,18 @@ pub async fn read_json<T: DeserializeOwned>(
     ) {
         return Err(unsupported_type(kind.as_deref(), "application/json"));
     }
-    // The reservation is released at the end of the function, when the bytes are parsed.
     let received = receive(state, request, MAX_JSON_BYTES).await?;
-    // Through an object, because a struct would also be read from an array.
-    let object: Map<String, Value> = serde_json::from_slice(&received.bytes).map_err(json_error)?;
-    serde_json::from_value(Value::Object(object)).map_err(json_error)
+    let parse = move || {
+        // The reservation is released at the end of the function, when the bytes are parsed.
+        let ReceivedBody {
+            bytes,
+            reservation: _reservation,
+        } = received;
+        // Through an object, because a struct would also be read from an array.
+        let object: Map<String, Value> = serde_json::from_slice(&bytes).map_err(json_error)?;
+        serde_json::from_value(Value::Object(object)).map_err(json_error)
+    };
+    state.codec.run(Workload::Small, parse).await
 }
 
 /// Reads a body that is one file of at most `limit` bytes. They count against the budget until they

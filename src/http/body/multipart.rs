@@ -2,15 +2,19 @@
 
 use super::parts::{BodyParts, MAX_PARAMETER_BYTES, json_error, parameters_too_long};
 use super::receive::ReceivedBody;
-use crate::http::body_budget::Reservation;
+use crate::http::memory_budget::Reservation;
 use crate::http::problem::ApiError;
 use axum::body::Body;
 use axum::extract::multipart::{Field, MultipartError};
 use axum::extract::{DefaultBodyLimit, FromRequest, Multipart, Request};
-use axum::http::HeaderMap;
+use axum::http::{HeaderMap, header};
 use bytes::Bytes;
+use futures_util::stream;
+use memchr::memmem;
 use serde_json::{Map, Value};
 use std::convert::Infallible;
+use std::task::Poll;
+use tokio::runtime::Handle;
 
 /// Bytes that the multipart parser is given at a time.
 const PIECE_BYTES: usize = 64 << 10;
@@ -18,8 +22,57 @@ const PIECE_BYTES: usize = 64 << 10;
 /// Most characters of an unknown part's name that an error repeats.
 const MAX_SHOWN_NAME: usize = 80;
 
-/// Copies the parts of a multipart body whose images have these `names`.
-pub(super) async fn split_multipart(
+/// Most bytes before the first part, and of the head of a part.
+const MAX_HEAD_BYTES: usize = 16 << 10;
+
+/// Copies the parts of a multipart body whose images have these `names`. Runs on a thread that may
+/// block.
+pub(super) fn split_multipart(
+    headers: HeaderMap,
+    received: ReceivedBody,
+    names: &'static [&'static str],
+) -> Result<(BodyParts, Reservation), ApiError> {
+    check_heads(&headers, &received.bytes)?;
+    // The parser is asynchronous, but all that it waits for is there.
+    Handle::current().block_on(split(headers, received, names))
+}
+
+/// Refuses a body in which what comes before the content of a part is long: the parser keeps all of
+/// it and searches it again with every piece, so that it would take quadratic time.
+fn check_heads(headers: &HeaderMap, bytes: &[u8]) -> Result<(), ApiError> {
+    let content_type = headers.get(header::CONTENT_TYPE);
+    let content_type = content_type.and_then(|value| value.to_str().ok());
+    let boundary = multer::parse_boundary(content_type.unwrap_or_default())
+        .map_err(|error| broken_because(&error.to_string()))?;
+    let opening = format!("--{boundary}");
+    let delimiter = format!("\r\n{opening}");
+    let delimiter = memmem::Finder::new(&delimiter);
+    let mut at = find_soon(bytes, opening.as_bytes())
+        .ok_or_else(|| broken_because("no part begins soon after its start"))?;
+    loop {
+        let rest = bytes.get(at..).unwrap_or_default();
+        if rest.starts_with(b"--") {
+            return Ok(());
+        }
+        let head = find_soon(rest, b"\r\n\r\n");
+        let head = head.ok_or_else(|| broken_because("the head of a part does not end soon"))?;
+        // The two bytes before may begin the next delimiter, where a part has no content.
+        let content = &rest[head - 2..];
+        match delimiter.find(content) {
+            Some(end) => at += head - 2 + end + delimiter.needle().len(),
+            // The parser says what is missing.
+            None => return Ok(()),
+        }
+    }
+}
+
+/// Where the first `needle` ends, if that is near the start.
+fn find_soon(bytes: &[u8], needle: &[u8]) -> Option<usize> {
+    let near = &bytes[..bytes.len().min(MAX_HEAD_BYTES)];
+    memmem::find(near, needle).map(|found| found + needle.len())
+}
+
+async fn split(
     headers: HeaderMap,
     received: ReceivedBody,
     names: &'static [&'static str],
@@ -51,14 +104,20 @@ async fn parser(headers: HeaderMap, bytes: Vec<u8>) -> Result<Multipart, ApiErro
         .map_err(|rejection| broken_because(&rejection.body_text()))
 }
 
-/// A body that comes bit by bit. The parser copies what it is given, so it never has more than one
-/// piece in memory.
+/// A body that comes bit by bit. The parser copies whatever is there before it looks at any of it,
+/// so there is a pause before each piece, and it never has more than one piece in memory.
 fn in_pieces(mut rest: Bytes) -> Body {
-    let pieces = std::iter::from_fn(move || {
+    let mut has_paused = false;
+    let pieces = stream::poll_fn(move |context| {
+        has_paused = !has_paused;
+        if has_paused {
+            context.waker().wake_by_ref();
+            return Poll::Pending;
+        }
         let piece = rest.split_to(rest.len().min(PIECE_BYTES));
-        (!piece.is_empty()).then_some(Ok::<_, Infallible>(piece))
+        Poll::Ready((!piece.is_empty()).then_some(Ok::<_, Infallible>(piece)))
     });
-    Body::from_stream(futures_util::stream::iter(pieces))
+    Body::from_stream(pieces)
 }
 
 /// The content of one part, which has at most `bytes_left` bytes.

@@ -1,6 +1,7 @@
 //! Receives a body: bounded in length, in time and in memory.
 
-use crate::http::body_budget::Reservation;
+use crate::http::config::HttpConfig;
+use crate::http::memory_budget::Reservation;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use axum::body::{Body, HttpBody};
@@ -10,7 +11,7 @@ use http_body_util::BodyExt;
 use hyper::body::Frame;
 use placeformer_core::error::ErrorCode;
 use std::time::Duration;
-use tokio::time::{Instant, timeout, timeout_at};
+use tokio::time::{Instant, timeout_at};
 
 /// First size of the buffer of a body whose length is not known.
 const FIRST_BUFFER_BYTES: usize = 16 << 10;
@@ -24,10 +25,36 @@ pub(super) struct ReceivedBody {
 
 /// Until when a body may arrive.
 struct ReceiveTimeouts {
+    start: Instant,
     /// When the whole body has to be there.
     end: Instant,
     /// Longest pause between two frames.
     pause: Duration,
+    /// Slowest average rate in bytes a second, after the first pause.
+    rate: u64,
+}
+
+impl ReceiveTimeouts {
+    fn new(config: &HttpConfig) -> Self {
+        let start = Instant::now();
+        Self {
+            start,
+            end: start + Duration::from_millis(config.body_timeout_ms),
+            pause: Duration::from_millis(config.body_idle_timeout_ms),
+            rate: config.min_body_bytes_per_second,
+        }
+    }
+
+    /// When the next frame has to be there, after so many bytes.
+    fn next(&self, received: usize) -> Instant {
+        let earned = match self.rate {
+            0 => Duration::MAX,
+            rate => Duration::from_secs_f64(received as f64 / rate as f64),
+        };
+        let by_rate = self.start.checked_add(self.pause.saturating_add(earned));
+        let by_rate = by_rate.unwrap_or(self.end);
+        self.end.min(by_rate).min(Instant::now() + self.pause)
+    }
 }
 
 /// Buffers a body of at most `limit` bytes within the body timeouts and the budget.
@@ -53,15 +80,12 @@ pub(super) async fn receive(
         Some(Ok(upper)) => upper.min(limit),
         _ => limit,
     };
-    let timeouts = ReceiveTimeouts {
-        end: Instant::now() + Duration::from_millis(state.http.body_timeout_ms),
-        pause: Duration::from_millis(state.http.body_idle_timeout_ms),
-    };
+    let timeouts = ReceiveTimeouts::new(&state.http);
     let mut received = ReceivedBody {
         bytes: Vec::new(),
         reservation: state.body_budget.reserve()?,
     };
-    while let Some(frame) = next_frame(&mut body, &timeouts).await? {
+    while let Some(frame) = next_frame(&mut body, timeouts.next(received.bytes.len())).await? {
         let Ok(data) = frame.into_data() else {
             continue;
         };
@@ -74,15 +98,11 @@ pub(super) async fn receive(
 }
 
 /// The next frame of the body; `None` at its end.
-async fn next_frame(
-    body: &mut Body,
-    timeouts: &ReceiveTimeouts,
-) -> Result<Option<Frame<Bytes>>, ApiError> {
-    let frame = timeout_at(timeouts.end, timeout(timeouts.pause, body.frame())).await;
-    let Ok(Ok(frame)) = frame else {
+async fn next_frame(body: &mut Body, end: Instant) -> Result<Option<Frame<Bytes>>, ApiError> {
+    let Ok(frame) = timeout_at(end, body.frame()).await else {
         return Err(ApiError::new(
             ErrorCode::RequestTimeout,
-            "the body stopped arriving or took too long",
+            "the body stopped arriving, came too slowly or took too long",
         ));
     };
     frame

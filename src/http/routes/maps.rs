@@ -1,11 +1,14 @@
 //! `/maps`: sets of references that are searched together.
 
+use crate::http::answer;
 use crate::http::body::{read_file, read_json};
+use crate::http::codec::Workload;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use axum::Json;
 use axum::extract::{Path, Request, State};
 use axum::http::StatusCode;
+use axum::response::Response;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{Calibration, MapName};
 use placeformer_store::MapInfo;
@@ -72,11 +75,12 @@ pub struct MapDeleted {
         (status = 200, description = "All maps.", body = MapList),
     ),
 )]
-pub async fn list(State(state): State<AppState>) -> Result<Json<MapList>, ApiError> {
+pub async fn list(State(state): State<AppState>) -> Result<Response, ApiError> {
     let maps = state.service()?.maps().await?;
-    Ok(Json(MapList {
+    let list = || MapList {
         maps: maps.into_iter().map(Into::into).collect(),
-    }))
+    };
+    answer::json(&state, Workload::Large, list).await
 }
 
 fn parse_name(text: &str) -> Result<MapName, ApiError> {

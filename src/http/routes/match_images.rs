@@ -5,7 +5,7 @@ use crate::http::body::{ImageUpload, read_upload};
 use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
-use crate::pipeline::{MatchTarget, MatchedPair};
+use crate::pipeline::{MatchAnswer, MatchTarget, MatchedPair};
 use axum::extract::{Request, State};
 use axum::response::Response;
 use placeformer_core::types::ReferenceId;
@@ -128,6 +128,11 @@ pub async fn match_images(
         }
     };
     let answer = service.match_images(query, other).await?;
+    let timings = answer.timings.clone();
+    timed(&state, &timings, move || answer_body(&answer)).await
+}
+
+fn answer_body(answer: &MatchAnswer) -> MatchAnswerBody {
     let mut spatial_score = 0;
     let mut combinations = BTreeMap::new();
     for combination in &answer.matched.combinations {
@@ -135,7 +140,7 @@ pub async fn match_images(
         let name = combination.score.scales.score_name();
         combinations.insert(name, combination_body(&answer.matched, combination));
     }
-    let body = MatchAnswerBody {
+    MatchAnswerBody {
         spatial_score,
         combinations,
         input_size: SizeBody {
@@ -144,8 +149,7 @@ pub async fn match_images(
         },
         timings_ms: timings_ms(&answer.timings),
         model: answer.model.to_string(),
-    };
-    Ok(timed(body, &answer.timings))
+    }
 }
 
 fn combination_body(pair: &MatchedPair, combination: &CombinationMatch) -> CombinationMatchBody {

@@ -355,6 +355,21 @@ pub fn access_log_of(path: &str) -> AccessLog {
     }
 }
 
+/// Whether `path` is for those who watch over the service: supervisors, balancers, Prometheus.
+pub fn is_probe(path: &str) -> bool {
+    access_log_of(path) == AccessLog::Quiet
+}
+
+/// Whether `path` says no more than how the service is, so that anyone may ask, from anywhere.
+pub fn is_health(path: &str) -> bool {
+    routes_at(path).any(Route::is_health)
+}
+
+/// Whether `path` is a page for people, which holds no data.
+pub fn is_page(path: &str) -> bool {
+    routes_at(path).any(|route| matches!(route.handler, Handler::Page(_)))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,6 +1,8 @@
 //! `/livez`, `/readyz`, `/metrics`: for supervisors, balancers and Prometheus.
 
+use crate::http::answer::BudgetedWriter;
 use crate::http::body::read_query;
+use crate::http::codec::Workload;
 use crate::http::problem::{self, ApiError, OwnBody};
 use crate::http::state::AppState;
 use crate::ops::{Metrics, Unready};
@@ -8,6 +10,7 @@ use axum::extract::State;
 use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
+use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
@@ -154,9 +157,20 @@ pub async fn metrics(State(state): State<AppState>) -> Result<Response, ApiError
     if let Some(service) = state.started() {
         service.observe().await;
     }
-    let text = state.metrics.render().map_err(|error| {
-        tracing::error!(%error, "the metrics cannot be rendered");
-        ApiError::new(ErrorCode::Internal, "the metrics cannot be rendered")
-    })?;
+    let shared = state.clone();
+    let text = state
+        .codec
+        .run(Workload::Small, move || render(&shared))
+        .await?;
     Ok(([(header::CONTENT_TYPE, Metrics::content_type())], text).into_response())
+}
+
+/// The text of all series. It counts against a budget until the client has taken it, because
+/// everyone may ask for it.
+fn render(state: &AppState) -> Result<Bytes, ApiError> {
+    let mut writer = BudgetedWriter::new(&state.metrics_budget);
+    match state.metrics.render_to(&mut writer) {
+        Ok(()) => Ok(writer.finish()),
+        Err(error) => Err(writer.failure(&error)),
+    }
 }

@@ -267,21 +267,21 @@ pub async fn query(State(state): State<AppState>, request: Request) -> Result<Re
         options,
     };
     let answer = service.query(query).await?;
-    Ok(respond(answer))
+    let timings = answer.timings.clone();
+    timed(&state, &timings, || answer_body(answer)).await
 }
 
-fn respond(answer: QueryAnswer) -> Response {
+fn answer_body(answer: QueryAnswer) -> QueryAnswerBody {
     let mut results = Vec::with_capacity(answer.results.len());
     for (position, result) in answer.results.into_iter().enumerate() {
         results.push(QueryResultBody::new(position, result));
     }
-    let body = QueryAnswerBody {
+    QueryAnswerBody {
         results,
         reranked: answer.reranked,
         matched: answer.confidence.matched,
         confidence: answer.confidence.confidence,
         timings_ms: timings_ms(&answer.timings),
         model: answer.model.to_string(),
-    };
-    timed(body, &answer.timings)
+    }
 }

@@ -1,12 +1,13 @@
 //! `/references`: the photos that make up the maps.
 
 use super::shapes::{ReferenceBody, json_object, point, present, timed};
+use crate::http::answer;
 use crate::http::body::{ImageUpload, read_json, read_query, read_upload};
+use crate::http::codec::Workload;
 use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
-use crate::pipeline::IngestRequest;
-use axum::Json;
+use crate::pipeline::{IngestAnswer, IngestRequest};
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderValue, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
@@ -143,8 +144,13 @@ pub async fn create(State(state): State<AppState>, request: Request) -> Result<R
     let (map, fields) = std::mem::take(&mut upload.params).checked()?;
     let answer = service.ingest(IngestRequest { map, fields, image }).await?;
     let location = HeaderValue::from_str(&format!("/references/{}", answer.reference.id));
-    let mut response = timed(ReferenceBody::from(answer.reference), &answer.timings);
-    if answer.created {
+    let IngestAnswer {
+        reference,
+        created,
+        timings,
+    } = answer;
+    let mut response = timed(&state, &timings, || ReferenceBody::from(reference)).await?;
+    if created {
         *response.status_mut() = StatusCode::CREATED;
     }
     if let Ok(location) = location {
@@ -233,29 +239,24 @@ pub struct ReferencePage {
         (status = 200, description = "A page.", body = ReferencePage),
     ),
 )]
-pub async fn list(
-    State(state): State<AppState>,
-    uri: Uri,
-) -> Result<Json<ReferencePage>, ApiError> {
+pub async fn list(State(state): State<AppState>, uri: Uri) -> Result<Response, ApiError> {
     let listing = read_query::<ListParams>(&uri)?.checked(state.http.max_page)?;
     let service = state.service()?;
-    let page = match listing {
+    let (references, next) = match listing {
         Listing::Named(map, external_id) => {
             let found = service.find_external(map, external_id).await?;
-            ReferencePage {
-                references: found.into_iter().map(Into::into).collect(),
-                next: None,
-            }
+            (Vec::from_iter(found), None)
         }
         Listing::Page { map, after, limit } => {
             let page = service.references(map, after, limit).await?;
-            ReferencePage {
-                references: page.references.into_iter().map(Into::into).collect(),
-                next: page.next.map(|id| id.to_string()),
-            }
+            (page.references, page.next)
         }
     };
-    Ok(Json(page))
+    let page = move || ReferencePage {
+        references: references.into_iter().map(Into::into).collect(),
+        next: next.map(|id| id.to_string()),
+    };
+    answer::json(&state, Workload::Large, page).await
 }
 
 fn parse_id(text: &str) -> Result<ReferenceId, ApiError> {
@@ -283,9 +284,9 @@ fn parse_id(text: &str) -> Result<ReferenceId, ApiError> {
 pub async fn get(
     State(state): State<AppState>,
     Path(id): Path<String>,
-) -> Result<Json<ReferenceBody>, ApiError> {
+) -> Result<Response, ApiError> {
     let reference = state.service()?.reference(parse_id(&id)?).await?;
-    Ok(Json(reference.into()))
+    answer::json(&state, Workload::Small, || ReferenceBody::from(reference)).await
 }
 
 /// Fields to change: one left out stays as it is, null clears it.
@@ -366,11 +367,11 @@ pub async fn update(
     State(state): State<AppState>,
     Path(id): Path<String>,
     request: Request,
-) -> Result<Json<ReferenceBody>, ApiError> {
+) -> Result<Response, ApiError> {
     let id = parse_id(&id)?;
     let change: ReferenceChange = read_json(&state, request).await?;
     let reference = state.service()?.update(id, change.checked()?).await?;
-    Ok(Json(reference.into()))
+    answer::json(&state, Workload::Small, || ReferenceBody::from(reference)).await
 }
 
 /// Delete a reference

@@ -1,10 +1,12 @@
 //! Shapes shared by several answers.
 
+use crate::http::answer;
+use crate::http::codec::Workload;
 use crate::http::problem::ApiError;
+use crate::http::state::AppState;
 use crate::pipeline::Timings;
-use axum::Json;
 use axum::http::{HeaderName, HeaderValue};
-use axum::response::{IntoResponse, Response};
+use axum::response::Response;
 use placeformer_core::types::{GeoPoint, Heading, Reference};
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
@@ -120,20 +122,27 @@ pub fn timings_ms(timings: &Timings) -> BTreeMap<&'static str, f64> {
 }
 
 /// JSON with the timings in a `Server-Timing` header.
-pub fn timed<T: Serialize>(body: T, timings: &Timings) -> Response {
+///
+/// # Errors
+/// `overloaded` if too many bytes of answers wait to be taken.
+pub async fn timed<T: Serialize>(
+    state: &AppState,
+    timings: &Timings,
+    make: impl FnOnce() -> T + Send + 'static,
+) -> Result<Response, ApiError> {
     let mut header = String::new();
     for (stage, ms) in timings_ms(timings) {
         let comma = if header.is_empty() { "" } else { ", " };
         // Writing to a string cannot fail.
         let _ = write!(header, "{comma}{stage};dur={ms}");
     }
-    let mut response = Json(body).into_response();
+    let mut response = answer::json(state, Workload::Small, make).await?;
     if !header.is_empty()
         && let Ok(value) = HeaderValue::from_str(&header)
     {
         response.headers_mut().insert(SERVER_TIMING, value);
     }
-    response
+    Ok(response)
 }
 
 /// Reads a JSON object, or a string with the text of one, which is how it comes in a query string.

@@ -70,11 +70,15 @@ pub enum Rejection {
     ClientGone,
     /// The files of the store are gone, exchanged, or cannot be written.
     StorageLost,
+    /// Too many bytes of answers wait for their clients.
+    AnswerMemory,
+    /// All connections but those for probes are taken.
+    Connections,
 }
 
 impl Rejection {
     /// All reasons.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 13] = [
         Self::QueueFull,
         Self::StoreBusy,
         Self::BodyMemory,
@@ -86,6 +90,8 @@ impl Rejection {
         Self::Deadline,
         Self::ClientGone,
         Self::StorageLost,
+        Self::AnswerMemory,
+        Self::Connections,
     ];
 
     /// Its label.
@@ -102,6 +108,8 @@ impl Rejection {
             Self::Draining => "draining",
             Self::Deadline => "deadline",
             Self::ClientGone => "client_gone",
+            Self::AnswerMemory => "answer_memory",
+            Self::Connections => "connections",
         }
     }
 }
@@ -128,6 +136,62 @@ impl MemoryComponent {
             Self::Index => "index",
             Self::Cache => "cache",
             Self::Sqlite => "sqlite",
+        }
+    }
+}
+
+/// What a connection may be used for; the values of `connections{kind}`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ConnectionKind {
+    /// Everything.
+    General,
+    /// Probes only.
+    Reserved,
+}
+
+impl ConnectionKind {
+    pub(super) const ALL: [Self; 2] = [Self::General, Self::Reserved];
+
+    pub(super) fn as_str(self) -> &'static str {
+        match self {
+            Self::General => "general",
+            Self::Reserved => "reserved",
+        }
+    }
+}
+
+/// Why the server ended a connection, or did not take it; the values of
+/// `connections_cut_total{reason}`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ConnectionCut {
+    /// It was idle, and a new client needed its place.
+    Evicted,
+    /// It had sent nothing while connections were scarce.
+    Silent,
+    /// There was no place for it.
+    Refused,
+    /// Its client took an answer too slowly.
+    SlowReader,
+    /// Its TLS handshake failed or took too long.
+    Handshake,
+}
+
+impl ConnectionCut {
+    pub(super) const ALL: [Self; 5] = [
+        Self::Evicted,
+        Self::Silent,
+        Self::Refused,
+        Self::SlowReader,
+        Self::Handshake,
+    ];
+
+    pub(super) fn as_str(self) -> &'static str {
+        match self {
+            Self::Evicted => "evicted",
+            Self::Silent => "silent",
+            Self::Refused => "refused",
+            Self::SlowReader => "slow_reader",
+            Self::Handshake => "handshake",
         }
     }
 }

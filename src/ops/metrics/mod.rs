@@ -6,7 +6,7 @@
 
 mod labels;
 
-pub use labels::{MemoryComponent, PipelineStage, Rejection};
+pub use labels::{ConnectionCut, ConnectionKind, MemoryComponent, PipelineStage, Rejection};
 
 use super::logging;
 use prometheus::core::Collector;
@@ -66,6 +66,7 @@ pub struct Metrics {
     disk_free_bytes: IntGauge,
     cache_lookups: IntCounterVec,
     lost_log_lines: LostLogLines,
+    connections: ConnectionSeries,
 }
 
 impl Metrics {
@@ -118,6 +119,7 @@ impl Metrics {
                 &["result"],
             )?,
             lost_log_lines: LostLogLines::new(&series)?,
+            connections: ConnectionSeries::new(&series)?,
             registry: series.0,
         };
         metrics.start_at_zero();
@@ -141,6 +143,12 @@ impl Metrics {
             self.cache_lookups.with_label_values(&[result]);
         }
         self.references.with_label_values(&[OTHER_MAPS]);
+        for kind in ConnectionKind::ALL {
+            self.set_connections(kind, 0);
+        }
+        for reason in ConnectionCut::ALL {
+            self.connections.cut.with_label_values(&[reason.as_str()]);
+        }
     }
 
     /// Makes the series of a route appear with zeros, one for each status it documents.
@@ -259,6 +267,19 @@ impl Metrics {
             .add(other as i64);
     }
 
+    /// Connections that are open.
+    pub fn set_connections(&self, kind: ConnectionKind, open: usize) {
+        let open = i64::try_from(open).unwrap_or(i64::MAX);
+        let series = self.connections.open.with_label_values(&[kind.as_str()]);
+        series.set(open);
+    }
+
+    /// A connection was ended, or not taken.
+    pub fn connection_cut(&self, reason: ConnectionCut) {
+        let series = self.connections.cut.with_label_values(&[reason.as_str()]);
+        series.inc();
+    }
+
     /// All series in Prometheus' text format.
     ///
     /// # Errors
@@ -266,6 +287,14 @@ impl Metrics {
     pub fn render(&self) -> Result<String, Error> {
         self.lost_log_lines.follow(logging::lost_lines());
         TextEncoder::new().encode_to_string(&self.registry.gather())
+    }
+
+    /// Writes what [`Metrics::render`] returns.
+    ///
+    /// # Errors
+    /// A series cannot be written as text, or `writer` takes no more.
+    pub fn render_to(&self, writer: &mut impl std::io::Write) -> Result<(), Error> {
+        TextEncoder::new().encode(&self.registry.gather(), writer)
     }
 
     /// Content type of [`Metrics::render`].
@@ -341,6 +370,25 @@ impl LostLogLines {
     fn follow(&self, lost: u64) {
         let counted = self.counted.fetch_max(lost, Ordering::Relaxed);
         self.counter.inc_by(lost.saturating_sub(counted));
+    }
+}
+
+/// Who is connected.
+struct ConnectionSeries {
+    open: IntGaugeVec,
+    cut: IntCounterVec,
+}
+
+impl ConnectionSeries {
+    fn new(series: &Series) -> Result<Self, Error> {
+        Ok(Self {
+            open: series.gauges("connections", "Connections that are open.", &["kind"])?,
+            cut: series.counters(
+                "connections_cut_total",
+                "Connections that the server ended, or did not take.",
+                &["reason"],
+            )?,
+        })
     }
 }
 

@@ -1,9 +1,11 @@
-//! One budget for the memory of all request bodies, so that many large uploads at once cannot
-//! exhaust the process.
+//! Budgets for memory that clients make the service use: one for the bodies of all requests, one
+//! for all answers that their clients have not taken yet. So neither many large uploads nor many
+//! listings that nobody reads can exhaust the process.
 //!
-//! Whoever reads a body reserves its memory first and enlarges or reduces the reservation as
-//! buffers come and go. What is left at the end is attached to the images themselves, so that it
-//! is given back when the pipeline has dropped the last clone of them.
+//! Whoever fills a buffer reserves its memory first and enlarges or reduces the reservation as
+//! buffers come and go. What is left at the end is attached to the bytes themselves, so that it is
+//! given back when the last clone of them is dropped: of an image by the pipeline, of an answer by
+//! the connection that has written it.
 
 use super::problem::ApiError;
 use crate::ops::Metrics;
@@ -16,16 +18,32 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 /// The unit of reservations in bytes; a permit of the semaphore stands for one block.
 const BLOCK_BYTES: usize = 64 << 10;
 
-/// The memory that bodies may take together.
-pub struct BodyBudget {
+/// The memory that buffers of one kind may take together.
+pub struct MemoryBudget {
     blocks: Arc<Semaphore>,
+    refusal: Refusal,
+}
+
+/// How a budget turns away what it has no room for.
+#[derive(Clone)]
+struct Refusal {
+    kind: BufferKind,
     metrics: Arc<Metrics>,
+}
+
+/// What the buffers of a budget hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BufferKind {
+    /// Bodies of requests, and the images in them.
+    Bodies,
+    /// Answers, until they are written to their connections.
+    Answers,
 }
 
 /// A share of the budget, given back when dropped.
 pub struct Reservation {
     permit: OwnedSemaphorePermit,
-    metrics: Arc<Metrics>,
+    refusal: Refusal,
 }
 
 /// A buffer that keeps its reservation as long as it lives.
@@ -41,13 +59,13 @@ impl AsRef<[u8]> for ReservedBuffer {
     }
 }
 
-impl BodyBudget {
+impl MemoryBudget {
     /// A budget of `bytes`.
-    pub fn new(bytes: usize, metrics: Arc<Metrics>) -> Self {
+    pub fn new(kind: BufferKind, bytes: usize, metrics: Arc<Metrics>) -> Self {
         let blocks = bytes.div_ceil(BLOCK_BYTES).min(Semaphore::MAX_PERMITS);
         Self {
             blocks: Arc::new(Semaphore::new(blocks)),
-            metrics,
+            refusal: Refusal { kind, metrics },
         }
     }
 
@@ -57,8 +75,8 @@ impl BodyBudget {
     /// `overloaded` if nothing of the budget is left.
     pub fn reserve(&self) -> Result<Reservation, ApiError> {
         Ok(Reservation {
-            permit: take_blocks(&self.blocks, 1, &self.metrics)?,
-            metrics: self.metrics.clone(),
+            permit: self.refusal.unless_taken(&self.blocks, 1)?,
+            refusal: self.refusal.clone(),
         })
     }
 }
@@ -72,7 +90,8 @@ impl Reservation {
         let have = self.permit.num_permits();
         let want = bytes.div_ceil(BLOCK_BYTES).max(1);
         if want > have {
-            let more = take_blocks(self.permit.semaphore(), want - have, &self.metrics)?;
+            let blocks = self.permit.semaphore();
+            let more = self.refusal.unless_taken(blocks, want - have)?;
             self.permit.merge(more);
         } else {
             drop(self.permit.split(have - want));
@@ -102,32 +121,45 @@ impl Reservation {
     }
 }
 
-fn take_blocks(
-    blocks: &Arc<Semaphore>,
-    count: usize,
-    metrics: &Metrics,
-) -> Result<OwnedSemaphorePermit, ApiError> {
-    let count = u32::try_from(count).unwrap_or(u32::MAX);
-    blocks.clone().try_acquire_many_owned(count).map_err(|_| {
-        metrics.rejected(Rejection::BodyMemory);
-        ApiError::new(
-            ErrorCode::Overloaded,
-            "too many bytes of bodies are being received at once",
-        )
-    })
+impl Refusal {
+    /// Takes so many blocks, or counts and returns the refusal.
+    fn unless_taken(
+        &self,
+        blocks: &Arc<Semaphore>,
+        count: usize,
+    ) -> Result<OwnedSemaphorePermit, ApiError> {
+        let count = u32::try_from(count).unwrap_or(u32::MAX);
+        let taken = blocks.clone().try_acquire_many_owned(count);
+        taken.map_err(|_| self.error())
+    }
+
+    fn error(&self) -> ApiError {
+        let (reason, detail) = match self.kind {
+            BufferKind::Bodies => (
+                Rejection::BodyMemory,
+                "too many bytes of bodies are being received at once",
+            ),
+            BufferKind::Answers => (
+                Rejection::AnswerMemory,
+                "too many bytes of answers wait for their clients to take them",
+            ),
+        };
+        self.metrics.rejected(reason);
+        ApiError::new(ErrorCode::Overloaded, detail)
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn metrics() -> Arc<Metrics> {
-        Arc::new(Metrics::new().unwrap())
+    fn budget(bytes: usize) -> MemoryBudget {
+        MemoryBudget::new(BufferKind::Bodies, bytes, Arc::new(Metrics::new().unwrap()))
     }
 
     #[test]
     fn reserved_memory_is_given_back() {
-        let budget = BodyBudget::new(128 << 10, metrics());
+        let budget = budget(128 << 10);
         let mut first = budget.reserve().unwrap();
         assert!(first.resize(129 << 10).is_err());
         first.resize(100 << 10).unwrap();
@@ -141,7 +173,7 @@ mod tests {
 
     #[test]
     fn bytes_are_charged_until_their_last_clone_is_gone() {
-        let budget = BodyBudget::new(64 << 10, metrics());
+        let budget = budget(64 << 10);
         let images = budget
             .reserve()
             .unwrap()
