@@ -1,4 +1,4 @@
-//! What operators watch and control: metrics, logs, health, memory and disk, shutdown.
+//! What operators watch and control: metrics, logs, health, memory and disk, reloading, shutdown.
 //!
 //! Nothing here knows the web or the stages. `pipeline` and `http` write into [`Metrics`] and
 //! [`Health`], and the HTTP surface shows them.
@@ -8,6 +8,7 @@ pub mod health;
 pub mod logging;
 pub mod memory;
 pub mod metrics;
+pub mod reload;
 pub mod shutdown;
 
 pub use health::{Health, Unready};
