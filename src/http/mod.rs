@@ -12,7 +12,9 @@
 //!
 //! 1. [`observe`] gives it an id and a span, and afterwards measures and logs its answer;
 //! 2. a net turns a panic into an answer ([`router`]);
-//! 3. [`authorise`] checks its key ([`api_keys`]) and the rate of its caller ([`rate_limits`]);
+//! 3. [`authorise`] checks its key ([`api_keys`], [`failed_keys`]) and the rate of its caller
+//!    ([`rate_limits`]), and passes on who that is and which maps it may use ([`access`],
+//!    [`map_scope`]);
 //! 4. the handler ([`routes`]) reads the body within its bounds ([`body`], [`body_budget`]) and
 //!    calls the pipeline.
 //!
@@ -21,12 +23,16 @@
 //! The server answers `/livez` and `/readyz` from its first moment. Everything that needs the
 //! pipeline answers `not_ready` until start-up puts the service into the state ([`state`]).
 
+pub mod access;
 pub mod api_keys;
+pub mod auth;
 pub mod authorise;
 pub mod body;
 pub mod body_budget;
 pub mod config;
 mod examples;
+pub mod failed_keys;
+pub mod map_scope;
 pub mod observe;
 pub mod openapi;
 pub mod problem;
@@ -37,7 +43,8 @@ pub mod routes;
 pub mod serve;
 pub mod state;
 
-pub use config::{ApiKey, AuthConfig, HttpConfig, Role};
+pub use config::{ApiKey, AuthConfig, HttpConfig, KeyHashes, Role};
+pub use map_scope::MapPattern;
 pub use router::app;
 pub use serve::serve;
 pub use state::AppState;

@@ -50,9 +50,10 @@ fn api_key(name: &str, role: Role) -> ApiKey {
     let hash = sha2::Sha256::digest(format!("key of {name}"));
     ApiKey {
         name: name.into(),
-        sha256: hash.iter().map(|byte| format!("{byte:02x}")).collect(),
+        sha256: hex::encode(hash).into(),
         role,
         requests_per_second: None,
+        maps: None,
     }
 }
 

@@ -1,12 +1,15 @@
 //! `/match`: the evidence that two images show the same place.
 
 use super::shapes::{SizeBody, timed, timings_ms};
+use crate::http::access::Access;
 use crate::http::body::{ImageUpload, read_upload};
 use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use crate::pipeline::{MatchTarget, MatchedPair};
+use axum::Extension;
 use axum::extract::{Request, State};
+use axum::http::StatusCode;
 use axum::response::Response;
 use placeformer_core::types::ReferenceId;
 use placeformer_vision::rerank::CombinationMatch;
@@ -112,6 +115,7 @@ pub struct CorrespondenceBody {
 )]
 pub async fn match_images(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     request: Request,
 ) -> Result<Response, ApiError> {
     let service = state.service()?;
@@ -120,14 +124,17 @@ pub async fn match_images(
     let reference_id = std::mem::take(&mut upload.params).checked()?;
     let other = match (upload.take_optional("reference")?, reference_id) {
         (Some(image), None) => MatchTarget::Image(image),
-        (None, Some(id)) => MatchTarget::Reference(id),
+        (None, Some(id)) => {
+            access.check_reference(service, id).await?;
+            MatchTarget::Reference(id)
+        }
         _ => {
             return Err(ApiError::invalid(
                 "give either the image \"reference\" or reference_id",
             ));
         }
     };
-    let answer = service.match_images(query, other).await?;
+    let answer = service.match_images(&access.caller, query, other).await?;
     let mut spatial_score = 0;
     let mut combinations = BTreeMap::new();
     for combination in &answer.matched.combinations {
@@ -145,7 +152,7 @@ pub async fn match_images(
         timings_ms: timings_ms(&answer.timings),
         model: answer.model.to_string(),
     };
-    Ok(timed(body, &answer.timings))
+    timed(StatusCode::OK, &body, &answer.timings)
 }
 
 fn combination_body(pair: &MatchedPair, combination: &CombinationMatch) -> CombinationMatchBody {

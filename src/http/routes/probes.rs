@@ -1,5 +1,6 @@
 //! `/livez`, `/readyz`, `/metrics`: for supervisors, balancers and Prometheus.
 
+use crate::http::access::Access;
 use crate::http::body::read_query;
 use crate::http::problem::{self, ApiError, OwnBody};
 use crate::http::state::AppState;
@@ -9,6 +10,7 @@ use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use placeformer_core::error::ErrorCode;
+use placeformer_core::types::MapName;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
@@ -128,7 +130,8 @@ fn answer(unready: Option<Unready>) -> Response {
 
 /// Metrics for Prometheus
 ///
-/// In the text exposition format.
+/// In the text exposition format. Where the server has keys, the names of maps are shown to those
+/// who present one, as far as it allows; for all others, and of all other maps, there is a sum.
 #[utoipa::path(
     get,
     path = "/metrics",
@@ -138,14 +141,18 @@ fn answer(unready: Option<Unready>) -> Response {
         (status = 200, description = "All series.", body = String, content_type = "text/plain"),
     ),
 )]
-pub async fn metrics(State(state): State<AppState>) -> Result<Response, ApiError> {
+pub async fn metrics(
+    State(state): State<AppState>,
+    Extension(access): Extension<Access>,
+) -> Result<Response, ApiError> {
     state
         .metrics
         .set_ready(state.health.unready_for_queries().is_none());
     if let Some(service) = state.started() {
         service.observe().await;
     }
-    let text = state.metrics.render().map_err(|error| {
+    let is_shown = |map: &MapName| access.maps.allows(map);
+    let text = state.metrics.render(is_shown).map_err(|error| {
         tracing::error!(%error, "the metrics cannot be rendered");
         ApiError::new(ErrorCode::Internal, "the metrics cannot be rendered")
     })?;

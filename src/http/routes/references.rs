@@ -1,21 +1,22 @@
 //! `/references`: the photos that make up the maps.
 
-use super::shapes::{ReferenceBody, json_object, point, present, timed};
+use super::shapes::{ReferenceBody, metadata, point, present, timed};
+use crate::http::access::Access;
 use crate::http::body::{ImageUpload, read_json, read_query, read_upload};
 use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use crate::pipeline::IngestRequest;
-use axum::Json;
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderValue, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use placeformer_core::error::ErrorCode;
-use placeformer_core::types::{ExternalId, Heading, MapName, ReferenceFields, ReferenceId};
-use placeformer_store::ReferencePatch;
+use placeformer_core::types::{
+    ExternalId, Heading, MapName, Metadata, ReferenceFields, ReferenceId, Timestamp,
+};
+use placeformer_store::{Cursor, ReferencePatch};
 use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value};
-use time::OffsetDateTime;
 use utoipa::{IntoParams, PartialSchema, ToSchema};
 
 /// What the body of a new reference consists of.
@@ -73,13 +74,14 @@ pub struct ReferenceParams {
         format = DateTime,
         example = "2026-05-17T09:30:00Z",
     )]
-    #[serde(default, with = "time::serde::rfc3339::option")]
-    pub captured_at: Option<OffsetDateTime>,
-    /// Anything else, as a JSON object; returned as it came.
+    #[serde(default)]
+    pub captured_at: Option<Timestamp>,
+    /// Anything else, as a JSON object; numbers and the order of keys come back as they came. No key
+    /// may occur twice in an object.
     #[schema(value_type = Option<Object>)]
     #[param(value_type = Option<String>, example = "{\"camera\":\"left\"}")]
-    #[serde(default, deserialize_with = "json_object")]
-    pub metadata: Option<Map<String, Value>>,
+    #[serde(default, deserialize_with = "metadata")]
+    pub metadata: Option<Metadata>,
 }
 
 impl ReferenceParams {
@@ -134,19 +136,28 @@ impl ReferenceParams {
         ),
     ),
 )]
-pub async fn create(State(state): State<AppState>, request: Request) -> Result<Response, ApiError> {
+pub async fn create(
+    State(state): State<AppState>,
+    Extension(access): Extension<Access>,
+    request: Request,
+) -> Result<Response, ApiError> {
     let service = state.service()?;
     // A client whose photo cannot be stored now learns so before it sends the photo.
     service.may_store()?;
     let mut upload = read_upload::<ReferenceParams>(&state, request, &UPLOAD).await?;
     let image = upload.take("image")?;
     let (map, fields) = std::mem::take(&mut upload.params).checked()?;
-    let answer = service.ingest(IngestRequest { map, fields, image }).await?;
+    access.check_map(&map)?;
+    let new = IngestRequest { map, fields, image };
+    let answer = service.ingest(&access.caller, new).await?;
     let location = HeaderValue::from_str(&format!("/references/{}", answer.reference.id));
-    let mut response = timed(ReferenceBody::from(answer.reference), &answer.timings);
-    if answer.created {
-        *response.status_mut() = StatusCode::CREATED;
-    }
+    let status = if answer.created {
+        StatusCode::CREATED
+    } else {
+        StatusCode::OK
+    };
+    let body = ReferenceBody::from(answer.reference);
+    let mut response = timed(status, &body, &answer.timings)?;
     if let Ok(location) = location {
         response.headers_mut().insert(header::LOCATION, location);
     }
@@ -167,7 +178,7 @@ pub struct ListParams {
     #[serde(default)]
     external_id: Option<ExternalId>,
     /// The `next` of the page before.
-    #[param(value_type = Option<String>, format = Uuid)]
+    #[param(value_type = Option<String>, pattern = "^at-[0-9]{1,19}$")]
     cursor: Option<String>,
     /// References in a page.
     #[param(minimum = 1, maximum = 1000)]
@@ -184,7 +195,7 @@ pub enum Listing {
         /// Only this map.
         map: Option<MapName>,
         /// Starting behind this one.
-        after: Option<ReferenceId>,
+        after: Option<Cursor>,
         /// References in the page.
         limit: usize,
     },
@@ -214,7 +225,8 @@ impl ListParams {
 /// A page of references.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct ReferencePage {
-    /// In the order they were added.
+    /// In the order they were added. With a key that is limited to maps there may be fewer than
+    /// `limit`, also none, although there is a next page.
     references: Vec<ReferenceBody>,
     /// Pass as `cursor` for the next page; null on the last.
     next: Option<String>,
@@ -222,7 +234,8 @@ pub struct ReferencePage {
 
 /// List references
 ///
-/// In the order they were added, page by page.
+/// In the order they were added, page by page. Whoever follows `next` to the end misses none that
+/// was added before.
 #[utoipa::path(
     get,
     path = "/references",
@@ -235,23 +248,30 @@ pub struct ReferencePage {
 )]
 pub async fn list(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     uri: Uri,
 ) -> Result<Json<ReferencePage>, ApiError> {
     let listing = read_query::<ListParams>(&uri)?.checked(state.http.max_page)?;
     let service = state.service()?;
     let page = match listing {
         Listing::Named(map, external_id) => {
-            let found = service.find_external(map, external_id).await?;
+            access.check_map(&map)?;
+            let finding = service.find_external(&access.caller, map, external_id);
+            let found = finding.await?;
             ReferencePage {
                 references: found.into_iter().map(Into::into).collect(),
                 next: None,
             }
         }
         Listing::Page { map, after, limit } => {
-            let page = service.references(map, after, limit).await?;
+            map.iter().try_for_each(|map| access.check_map(map))?;
+            let listing = service.references(&access.caller, map, after, limit);
+            let mut page = listing.await?;
+            let references = &mut page.references;
+            references.retain(|reference| access.maps.allows(&reference.map));
             ReferencePage {
                 references: page.references.into_iter().map(Into::into).collect(),
-                next: page.next.map(|id| id.to_string()),
+                next: page.next.map(|cursor| cursor.to_string()),
             }
         }
     };
@@ -282,9 +302,13 @@ fn parse_id(text: &str) -> Result<ReferenceId, ApiError> {
 )]
 pub async fn get(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(id): Path<String>,
 ) -> Result<Json<ReferenceBody>, ApiError> {
-    let reference = state.service()?.reference(parse_id(&id)?).await?;
+    let service = state.service()?;
+    let id = parse_id(&id)?;
+    access.check_reference(service, id).await?;
+    let reference = service.reference(&access.caller, id).await?;
     Ok(Json(reference.into()))
 }
 
@@ -311,16 +335,12 @@ pub struct ReferenceChange {
     /// When the photo was taken (RFC 3339).
     #[schema(value_type = Option<String>, format = DateTime)]
     #[serde(default, deserialize_with = "present")]
-    captured_at: Option<Option<Rfc3339>>,
+    captured_at: Option<Option<Timestamp>>,
     /// Replaces the whole object.
     #[schema(value_type = Option<Object>)]
     #[serde(default, deserialize_with = "present")]
-    metadata: Option<Option<Map<String, Value>>>,
+    metadata: Option<Option<Metadata>>,
 }
-
-#[derive(Debug, Deserialize)]
-#[serde(transparent)]
-struct Rfc3339(#[serde(with = "time::serde::rfc3339")] OffsetDateTime);
 
 impl ReferenceChange {
     fn checked(self) -> Result<ReferencePatch, ApiError> {
@@ -342,7 +362,7 @@ impl ReferenceChange {
             external_id: self.external_id,
             location,
             heading,
-            captured_at: self.captured_at.map(|at| at.map(|Rfc3339(at)| at)),
+            captured_at: self.captured_at,
             metadata: self.metadata,
         })
     }
@@ -364,12 +384,16 @@ impl ReferenceChange {
 )]
 pub async fn update(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(id): Path<String>,
     request: Request,
 ) -> Result<Json<ReferenceBody>, ApiError> {
+    let service = state.service()?;
     let id = parse_id(&id)?;
+    access.check_reference(service, id).await?;
     let change: ReferenceChange = read_json(&state, request).await?;
-    let reference = state.service()?.update(id, change.checked()?).await?;
+    let changing = service.update(&access.caller, id, change.checked()?);
+    let reference = changing.await?;
     Ok(Json(reference.into()))
 }
 
@@ -388,8 +412,12 @@ pub async fn update(
 )]
 pub async fn delete(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(id): Path<String>,
 ) -> Result<Response, ApiError> {
-    state.service()?.delete(parse_id(&id)?).await?;
+    let service = state.service()?;
+    let id = parse_id(&id)?;
+    access.check_reference(service, id).await?;
+    service.delete(&access.caller, id).await?;
     Ok(StatusCode::NO_CONTENT.into_response())
 }

@@ -68,11 +68,13 @@ pub enum Rejection {
     Deadline,
     /// Its client left.
     ClientGone,
+    /// Its address presented too many keys that are not known.
+    FailedKeys,
 }
 
 impl Rejection {
     /// All reasons.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::QueueFull,
         Self::StoreBusy,
         Self::BodyMemory,
@@ -83,6 +85,7 @@ impl Rejection {
         Self::Draining,
         Self::Deadline,
         Self::ClientGone,
+        Self::FailedKeys,
     ];
 
     /// Its label.
@@ -98,6 +101,7 @@ impl Rejection {
             Self::Draining => "draining",
             Self::Deadline => "deadline",
             Self::ClientGone => "client_gone",
+            Self::FailedKeys => "failed_keys",
         }
     }
 }

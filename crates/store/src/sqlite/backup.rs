@@ -7,7 +7,7 @@
 use super::directory::io;
 use super::engine::failed;
 use crate::error::StoreError;
-use placeformer_core::files::{directory_of, sync_directory, with_suffix};
+use placeformer_core::files::{create_private_file, directory_of, sync_directory, with_suffix};
 use rusqlite::Connection;
 use rusqlite::backup::{Backup, StepResult};
 use std::fs::{self, File};
@@ -25,6 +25,9 @@ pub(super) fn write(connection: &Connection, target: &Path) -> Result<u64, Store
         });
     }
     let partial = with_suffix(target, ".partial");
+    // What an interrupted backup left is of no use, and may be open to others.
+    let _ = fs::remove_file(&partial);
+    create_private_file(&partial).map_err(io("cannot create the backup", target))?;
     if let Err(error) = copy(connection, &partial) {
         // The caller needs the first error, so a failure to remove the rest is not reported.
         let _ = fs::remove_file(&partial);
