@@ -191,9 +191,10 @@ mod tests {
     fn times_may_stop_anywhere() {
         assert_eq!(
             parse_time("20190102_030405"),
-            Some(datetime!(2019-01-02 3:04:05 UTC))
+            Timestamp::of(datetime!(2019-01-02 3:04:05 UTC))
         );
-        assert_eq!(parse_time("2019"), Some(datetime!(2019-01-01 0:00 UTC)));
+        let new_year = Timestamp::of(datetime!(2019-01-01 0:00 UTC));
+        assert_eq!(parse_time("2019"), new_year);
         assert_eq!(parse_time("201913"), None);
         assert_eq!(parse_time(""), None);
     }

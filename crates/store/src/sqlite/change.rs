@@ -154,4 +154,4 @@ pub(super) fn set_calibration(
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

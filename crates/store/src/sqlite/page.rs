@@ -175,3 +175,100 @@ fn identities(
     };
     read().map_err(failed("listing references one by one"))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::SqliteStore;
+    use super::super::change::tests::{config, new_reference, rewrite};
+    use super::*;
+    use crate::{Inserted, ReadPlaces, WritePlaces};
+    use tempfile::TempDir;
+
+    fn add(store: &SqliteStore) -> ReferenceId {
+        match store.insert(new_reference()).unwrap() {
+            Inserted::Created(reference) => reference.id,
+            Inserted::AlreadyThere(_) => panic!("it has no external id"),
+        }
+    }
+
+    /// A store of six, the last three added after the clock was set back to before the first.
+    fn set_back() -> (TempDir, SqliteStore, Vec<ReferenceId>) {
+        let directory = tempfile::tempdir().unwrap();
+        let store = SqliteStore::open(directory.path(), &config()).unwrap();
+        let mut ids: Vec<ReferenceId> = (0..6).map(|_| add(&store)).collect();
+        drop(store);
+        for (i, id) in ids[3..].iter_mut().enumerate() {
+            // Identities begin with the time.
+            let earlier = [i as u8; 16];
+            rewrite(&directory, *id, |row| row.id = earlier);
+            *id = ReferenceId::from_bytes(earlier);
+        }
+        let store = SqliteStore::open(directory.path(), &config()).unwrap();
+        (directory, store, ids)
+    }
+
+    #[test]
+    fn a_clock_that_is_set_back_hides_nothing_from_whoever_reads_page_by_page() {
+        let (_directory, store, ids) = set_back();
+        let city: MapName = "city".parse().unwrap();
+        for map in [None, Some(&city)] {
+            for limit in 1..8 {
+                let mut listed = Vec::new();
+                let mut after = None;
+                loop {
+                    let page = store.list(map, after, limit).unwrap();
+                    listed.extend(page.references.iter().map(|reference| reference.id));
+                    after = page.next;
+                    if after.is_none() {
+                        break;
+                    }
+                }
+                assert_eq!(listed, ids, "{limit} at a time");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_added_or_deleted_between_two_pages_disturbs_nothing_else() {
+        let (_directory, store, ids) = set_back();
+        let first = store.list(None, None, 4).unwrap();
+        store.delete(ids[3]).unwrap();
+        store.delete(ids[5]).unwrap();
+        let added = add(&store);
+        let second = store.list(None, first.next, 4).unwrap();
+        let listed: Vec<_> = second
+            .references
+            .iter()
+            .map(|reference| reference.id)
+            .collect();
+        assert_eq!((listed, second.next), (vec![ids[4], added], None));
+    }
+
+    #[test]
+    fn one_by_one_the_pages_are_the_same() {
+        let (_directory, store, _) = set_back();
+        let database = &store.database;
+        let city: MapName = "city".parse().unwrap();
+        for map in [None, Some(&city)] {
+            for (start, limit) in [(0, 1), (0, 4), (2, 3), (2, 4), (5, 1), (6, 2), (0, 9)] {
+                let after = Some(Cursor::at(start));
+                let expected = store.list(map, after, limit).unwrap();
+                let found = database.read(|connection| {
+                    let map = map.map(|name| MapRow::require(connection, name));
+                    let mut listing = Listing {
+                        map: map.transpose()?.map(|map| map.number),
+                        after: ReferenceNumber::at(Cursor::at(start)),
+                        limit,
+                        references: Vec::new(),
+                    };
+                    let has_more = database.fill_one_by_one(connection, &mut listing)?;
+                    Ok(Page {
+                        next: has_more.then(|| listing.after.cursor()),
+                        references: listing.references,
+                    })
+                });
+                assert_eq!(found.unwrap(), expected, "{limit} after {start}");
+            }
+        }
+    }
+}
