@@ -130,7 +130,7 @@ QUERY_SEEDS = [
     "map=a&lat=1",
     "map=a&heading=-1e-30&metadata=%7B%22camera%22:%22left%22%7D",
     "map=a&metadata=7",
-    "map=a&limit=1000&cursor=0197f3c2-7c1e-7d3a-9b1f-2f6f0c1d2e3f",
+    "map=a&limit=1000&cursor=at-1204",
     "limit=0",
     "external_id=a",
     "map=a&external_id=a",

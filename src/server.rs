@@ -4,9 +4,9 @@
 //! the start. The model and the store are opened on a blocking thread; requests are served once
 //! both are open.
 
-use crate::config::Config;
+use crate::config::{Config, ConfigError, LoadedFrom};
 use crate::http::{AppState, Certificate, TlsError, serve_encrypted};
-use crate::ops::{Health, Metrics, disk, shutdown};
+use crate::ops::{Health, Metrics, disk, reload, shutdown};
 use crate::pipeline::{DescriptorSource, Parts, PipelineError, Service};
 use placeformer_core::progress::Progress;
 use placeformer_core::types::InvalidValue;
@@ -89,6 +89,9 @@ pub enum ServerError {
     /// The pipeline cannot start on the model and the store.
     #[error(transparent)]
     Pipeline(#[from] PipelineError),
+    /// It cannot be told when keys are to be read again.
+    #[error("SIGHUP cannot be received")]
+    Reload(#[source] std::io::Error),
     /// The thread that opens the model and the store panicked, or the runtime shut down.
     #[error("start-up failed: {0}")]
     Interrupted(String),
@@ -231,6 +234,7 @@ pub async fn run_server(
         health,
     )?;
     let certificate = Certificate::open(&config.http).await?;
+    let _following = follow_keys(&state, config.loaded_from.clone())?;
     let watching = tokio::spawn(watch_disk(config.clone(), state.clone()));
     let _watching = AbortOnDropHandle::new(watching);
     let opening = open(state.clone(), config, loaders);
@@ -282,6 +286,53 @@ fn start_service(
         health,
     })?;
     Ok(service)
+}
+
+/// Reads the keys again whenever there is a reason to, for as long as the result lives. Settings
+/// that a program made are not read again.
+fn follow_keys(
+    state: &AppState,
+    loaded_from: Option<LoadedFrom>,
+) -> Result<Option<AbortOnDropHandle<()>>, ServerError> {
+    let Some(loaded_from) = loaded_from else {
+        return Ok(None);
+    };
+    let files = loaded_from.file.iter().cloned().collect();
+    let mut reasons = reload::watch(files).map_err(ServerError::Reload)?;
+    let state = state.clone();
+    let following = async move {
+        // The file may have changed after the settings were read and before it was watched.
+        loop {
+            let loaded_from = loaded_from.clone();
+            let read = spawn_blocking(move || loaded_from.load_again()).await;
+            // It fails only if the runtime ends, or if reading panicked, which is in the log.
+            if let Ok(read) = read {
+                renew_keys(&state, read);
+            }
+            if reasons.changed().await.is_err() {
+                return;
+            }
+        }
+    };
+    Ok(Some(AbortOnDropHandle::new(tokio::spawn(following))))
+}
+
+/// Puts keys that were read again in force, if they are good and others than before.
+fn renew_keys(state: &AppState, read: Result<Config, ConfigError>) {
+    let renewed = read
+        .map_err(anyhow::Error::from)
+        .and_then(|config| Ok((state.renew_auth(&config.auth)?, config.auth.keys.len())));
+    match renewed {
+        Ok((true, holders)) => tracing::info!(holders, "other keys are in force"),
+        Ok((false, _)) => tracing::debug!("the keys are the same as before"),
+        Err(error) => {
+            let error = format!("{error:#}");
+            tracing::error!(
+                error,
+                "the keys cannot be read again; the old ones stay in force"
+            );
+        }
+    }
 }
 
 /// Brings the health and the gauge of free bytes up to date with the disk, again and again.

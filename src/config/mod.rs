@@ -58,6 +58,29 @@ pub struct Config {
     pub rerank: RerankConfig,
     /// Logs, written to standard error.
     pub log: LogConfig,
+    /// Where the settings were read from; none for settings that a program made.
+    #[serde(skip)]
+    #[schema(ignore)]
+    pub loaded_from: Option<LoadedFrom>,
+}
+
+/// What settings are read from, besides the environment, so that they can be read again.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoadedFrom {
+    /// The configuration file, if there is one.
+    pub file: Option<PathBuf>,
+    /// What the command line says.
+    overrides: Overrides,
+}
+
+impl LoadedFrom {
+    /// Reads all sources again and checks the result.
+    ///
+    /// # Errors
+    /// As of [`Config::load`].
+    pub fn load_again(&self) -> Result<Config, ConfigError> {
+        Config::load(self.file.as_deref(), &self.overrides)
+    }
 }
 
 /// Where the data lives.
@@ -84,7 +107,12 @@ impl Config {
     /// The file cannot be read or is not TOML; a key is unknown, has the wrong type or is out of
     /// range; an environment variable is misspelt.
     pub fn load(file: Option<&Path>, overrides: &Overrides) -> Result<Self, ConfigError> {
-        Self::load_with_environment(file, std::env::vars_os(), overrides)
+        let mut config = Self::load_with_environment(file, std::env::vars_os(), overrides)?;
+        config.loaded_from = Some(LoadedFrom {
+            file: file.map(Path::to_owned),
+            overrides: overrides.clone(),
+        });
+        Ok(config)
     }
 
     fn load_with_environment(

@@ -102,9 +102,10 @@ fn the_printed_configuration_reads_back_the_same() {
     config.http.max_page = 33;
     config.auth.keys.push(ApiKey {
         name: "fleet".into(),
-        sha256: "ab".repeat(32),
+        sha256: "ab".repeat(32).into(),
         role: Role::Read,
         requests_per_second: None,
+        maps: None,
     });
     config.log.filter = "placeformer=debug".into();
     config.extract.weights = Some("own \"quoted\".safetensors".into());

@@ -1,8 +1,11 @@
 //! Settings of the web surface.
 
 use super::cross_origin::CrossOriginRules;
+use super::map_scope::MapPattern;
 use placeformer_core::types::InvalidValue;
 use serde::{Deserialize, Serialize};
+use std::collections::HashSet;
+use std::fmt;
 use std::net::IpAddr;
 use std::path::PathBuf;
 use utoipa::ToSchema;
@@ -167,76 +170,251 @@ impl HttpConfig {
 
 /// Who may do what. Without keys the service is open. The comments of the fields are printed as the
 /// manual of the configuration file.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, ToSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct AuthConfig {
-    /// Accepted API keys; without any, the service is open to everyone.
+    /// Accepted API keys; without any, the service is open to everyone. They are read again on
+    /// SIGHUP and when the configuration file changes, and so are the other settings of this
+    /// section. A file that is not valid, or has no keys left, is reported in the log and changes
+    /// nothing.
     pub keys: Vec<ApiKey>,
-    /// Whether /metrics needs a key, too.
+    /// Whether /metrics needs a key, too. If not, a request without a key gets all numbers, but no
+    /// name of a map, where there are keys.
     pub protect_metrics: bool,
-    /// Requests per second of one key (of one address where there are no keys); 0 is unbounded.
+    /// Requests per second of one key (of one address where there are no keys, of one /64 network of
+    /// IPv6); 0 is unbounded.
     pub requests_per_second: u32,
     /// Requests that may come at once beyond that rate; 0 is as many as one second allows.
     pub burst: u32,
+    /// Unknown keys that one address may present in a minute; then it is answered 429 until the
+    /// minute is over, whatever it presents. 0 is unbounded, which is the choice behind a proxy:
+    /// all requests come from its address, and one client with an old key would shut out the
+    /// others.
+    pub failed_keys_per_minute: u32,
+}
+
+impl Default for AuthConfig {
+    fn default() -> Self {
+        Self {
+            keys: Vec::new(),
+            protect_metrics: false,
+            requests_per_second: 0,
+            burst: 0,
+            failed_keys_per_minute: 30,
+        }
+    }
 }
 
 /// What a key allows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
-    /// Queries, matches and listings.
+    /// The metrics, with the names of maps.
+    Metrics,
+    /// Queries, matches and listings; the metrics, too.
     Read,
     /// Everything.
     Write,
 }
 
-/// One accepted key. The key itself is nowhere kept.
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Metrics => "metrics",
+            Self::Read => "read",
+            Self::Write => "write",
+        })
+    }
+}
+
+/// Who holds keys, and what they allow. The keys themselves are nowhere kept.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ApiKey {
     /// Who uses it; appears in logs.
     pub name: String,
-    /// SHA-256 of the key in hexadecimal (printf %s KEY | sha256sum).
-    pub sha256: String,
-    /// "read" (queries, matches and listings) or "write" (everything).
+    /// SHA-256 of the key in hexadecimal (printf %s KEY | sha256sum). A list of several: each of
+    /// these keys is good, so that one can be replaced by the next without a gap.
+    #[schema(value_type = String)]
+    pub sha256: KeyHashes,
+    /// "read" (queries, matches, listings and metrics), "write" (everything), or "metrics" (only
+    /// these).
     #[schema(value_type = String)]
     pub role: Role,
-    /// Requests per second of this key, if they differ from those of the others.
+    /// Requests per second of all keys of this name together, if they differ from those of the
+    /// others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub requests_per_second: Option<u32>,
+    /// The maps that it is limited to, by name or by the beginning of names (["city-*"]). Left out:
+    /// all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<Vec<String>>)]
+    pub maps: Option<Vec<MapPattern>>,
+}
+
+/// The hashes of one or several keys, as a text or a list of them.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "OneOrSeveral", into = "OneOrSeveral")]
+pub struct KeyHashes(Vec<String>);
+
+impl FromIterator<String> for KeyHashes {
+    fn from_iter<I: IntoIterator<Item = String>>(hashes: I) -> Self {
+        Self(hashes.into_iter().collect())
+    }
+}
+
+impl From<String> for KeyHashes {
+    fn from(hash: String) -> Self {
+        Self(vec![hash])
+    }
+}
+
+/// How hashes are written in the settings.
+#[derive(Serialize, Deserialize)]
+#[serde(untagged, expecting = "a text, or a list of texts")]
+enum OneOrSeveral {
+    One(String),
+    Several(Vec<String>),
+}
+
+impl From<OneOrSeveral> for KeyHashes {
+    fn from(hashes: OneOrSeveral) -> Self {
+        match hashes {
+            OneOrSeveral::One(hash) => Self(vec![hash]),
+            OneOrSeveral::Several(hashes) => Self(hashes),
+        }
+    }
+}
+
+impl From<KeyHashes> for OneOrSeveral {
+    fn from(hashes: KeyHashes) -> Self {
+        match <[String; 1]>::try_from(hashes.0) {
+            Ok([hash]) => Self::One(hash),
+            Err(hashes) => Self::Several(hashes),
+        }
+    }
 }
 
 impl AuthConfig {
-    /// Checks names and hashes.
+    /// Checks names, hashes and maps.
+    ///
+    /// # Errors
+    /// Names the first key that breaks a rule.
     pub fn check(&self) -> Result<(), InvalidValue> {
-        let mut names = std::collections::HashSet::new();
+        let broken = |reason| InvalidValue::new("auth.keys", reason);
+        let mut names = HashSet::new();
+        let mut hashes = HashSet::new();
         for key in &self.keys {
-            if key.name.is_empty() || !names.insert(&key.name) {
-                return Err(InvalidValue::new(
-                    "auth.keys",
-                    format!("the name {:?} is empty or used twice", key.name),
-                ));
+            let name = &key.name;
+            if name.is_empty() || !names.insert(name) {
+                let reason = format!("the name {name:?} is empty or used twice");
+                return Err(broken(reason));
             }
-            key.hash()?;
+            for hash in key.hashes()? {
+                if !hashes.insert(hash) {
+                    let reason = format!("a key of {name:?} is listed a second time");
+                    return Err(broken(reason));
+                }
+            }
+            if key.maps.as_ref().is_some_and(Vec::is_empty) {
+                let reason = format!("maps of key {name:?} is empty: leave it out to allow all");
+                return Err(broken(reason));
+            }
         }
         Ok(())
     }
 }
 
 impl ApiKey {
-    /// The 32 bytes of the hash.
-    pub fn hash(&self) -> Result<[u8; 32], InvalidValue> {
+    /// The 32 bytes of each hash.
+    ///
+    /// # Errors
+    /// There is none, or one is not 64 hexadecimal digits.
+    pub fn hashes(&self) -> Result<Vec<[u8; 32]>, InvalidValue> {
         let wrong = || {
-            InvalidValue::new(
-                "auth.keys",
-                format!(
-                    "sha256 of key {:?} is not 64 hexadecimal digits (printf %s KEY | sha256sum)",
-                    self.name
-                ),
-            )
+            let reason = format!(
+                "sha256 of key {:?} is not 64 hexadecimal digits (printf %s KEY | sha256sum), nor \
+                 a list of such",
+                self.name
+            );
+            InvalidValue::new("auth.keys", reason)
         };
-        let mut hash = [0; 32];
-        hex::decode_to_slice(&self.sha256, &mut hash).map_err(|_| wrong())?;
-        Ok(hash)
+        if self.sha256.0.is_empty() {
+            return Err(wrong());
+        }
+        let mut hashes = Vec::with_capacity(self.sha256.0.len());
+        for text in &self.sha256.0 {
+            let mut hash = [0; 32];
+            hex::decode_to_slice(text, &mut hash).map_err(|_| wrong())?;
+            hashes.push(hash);
+        }
+        Ok(hashes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn key(name: &str, hashes: &[&str]) -> ApiKey {
+        ApiKey {
+            name: name.into(),
+            sha256: hashes.iter().map(|hash| (*hash).to_owned()).collect(),
+            role: Role::Read,
+            requests_per_second: None,
+            maps: None,
+        }
+    }
+
+    fn check(keys: Vec<ApiKey>) -> Result<(), InvalidValue> {
+        AuthConfig {
+            keys,
+            ..Default::default()
+        }
+        .check()
+    }
+
+    #[test]
+    fn only_hexadecimal_digits_are_a_hash() {
+        let good = "0123456789abcdefABCDEF".repeat(3)[..64].to_owned();
+        check(vec![key("a", &[&good])]).unwrap();
+        for wrong in [
+            // A parser of numbers takes a sign before a digit.
+            "+f".repeat(32),
+            format!("+{}", &good[1..]),
+            format!("-{}", &good[1..]),
+            format!(" {}", &good[1..]),
+            format!("0x{}", &good[2..]),
+            format!("{}g", &good[1..]),
+            "é".repeat(32),
+            good[1..].to_owned(),
+            format!("{good}0"),
+            String::new(),
+        ] {
+            let error = check(vec![key("a", &[&wrong])]).unwrap_err();
+            assert!(error.reason.contains("hexadecimal"), "{wrong}: {error}");
+        }
+        assert!(check(vec![key("a", &[&good, "x"])]).is_err());
+        assert!(check(vec![key("a", &[])]).is_err());
+    }
+
+    #[test]
+    fn nobody_shares_a_name_or_a_key() {
+        let hash = |digit: &str| digit.repeat(64);
+        let [one, two, three] = [hash("1"), hash("2"), hash("3")];
+        check(vec![key("a", &[&one, &two]), key("b", &[&three])]).unwrap();
+        let refused = [
+            vec![key("a", &[&one]), key("a", &[&two])],
+            vec![key("a", &[&one]), key("b", &[&one])],
+            vec![key("a", &[&one, &one])],
+            vec![key("", &[&one])],
+            vec![ApiKey {
+                maps: Some(vec![]),
+                ..key("a", &[&one])
+            }],
+        ];
+        for keys in refused {
+            assert!(check(keys.clone()).is_err(), "{keys:?}");
+        }
     }
 }

@@ -144,7 +144,7 @@ pub(super) fn reference() -> Value {
 
 /// A page of a listing.
 pub(super) fn reference_page() -> Value {
-    json!({"references": [reference()], "next": ID})
+    json!({"references": [reference()], "next": "at-1204"})
 }
 
 /// A body of `/query`.

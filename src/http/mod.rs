@@ -14,7 +14,9 @@
 //! 2. a net turns a panic into an answer ([`router`]);
 //! 3. [`reserved`] lets only probes through if it came over a connection that is kept for them;
 //! 4. [`cross_origin`] refuses it if a browser sent it for a foreign web page;
-//! 5. [`authorise`] checks its key ([`api_keys`]) and the rate of its caller ([`rate_limits`]);
+//! 5. [`authorise`] checks its key ([`api_keys`], [`failed_keys`]) and the rate of its caller
+//!    ([`rate_limits`]), and passes on who that is and which maps it may use ([`access`],
+//!    [`map_scope`]);
 //! 6. the handler ([`routes`]) reads the body within its bounds ([`body`], [`memory_budget`]) and
 //!    calls the pipeline. Bodies are taken apart, and answers written as JSON ([`answer`]), on
 //!    threads of their own ([`codec`]), so that no large one holds up the others.
@@ -24,8 +26,10 @@
 //! The server answers `/livez` and `/readyz` from its first moment. Everything that needs the
 //! pipeline answers `not_ready` until start-up puts the service into the state ([`state`]).
 
+pub mod access;
 pub mod answer;
 pub mod api_keys;
+pub mod auth;
 pub mod authorise;
 pub mod body;
 pub mod codec;
@@ -33,6 +37,8 @@ pub mod config;
 pub mod connection_info;
 pub mod cross_origin;
 mod examples;
+pub mod failed_keys;
+pub mod map_scope;
 pub mod memory_budget;
 pub mod observe;
 pub mod openapi;
@@ -45,7 +51,8 @@ pub mod routes;
 pub mod serve;
 pub mod state;
 
-pub use config::{ApiKey, AuthConfig, HttpConfig, Role};
+pub use config::{ApiKey, AuthConfig, HttpConfig, KeyHashes, Role};
+pub use map_scope::MapPattern;
 pub use router::app;
 pub use serve::tls::{Certificate, TlsError};
 pub use serve::{serve, serve_encrypted};

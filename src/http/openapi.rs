@@ -259,7 +259,9 @@ fn problem(code: ErrorCode) -> Value {
 /// Nothing, or a key in either header: a server without keys needs none.
 fn describe_security(operation: &mut Value, scope: Scope) {
     match scope {
-        Scope::Public | Scope::Metrics => {}
-        Scope::Key(_) => operation["security"] = json!([{}, {"bearer": []}, {"header": []}]),
+        Scope::Public => {}
+        Scope::Metrics | Scope::Key(_) => {
+            operation["security"] = json!([{}, {"bearer": []}, {"header": []}])
+        }
     }
 }

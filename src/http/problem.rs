@@ -145,8 +145,17 @@ pub fn set_error_headers(headers: &mut HeaderMap, code: ErrorCode) {
 impl From<PipelineError> for ApiError {
     fn from(error: PipelineError) -> Self {
         let code = error.code();
-        if code.status() >= 500 && code.status() != 503 {
-            tracing::error!(code = code.as_str(), error = %error_chain(&error), "request failed");
+        // Only what somebody has to repair is loud. A refusal for want of capacity or room is counted
+        // in the metrics, and a deadline is what the client asked for.
+        match code.status() {
+            500 => {
+                tracing::error!(code = code.as_str(), error = %error_chain(&error), "request failed");
+            }
+            501.. => {
+                let error = error_chain(&error);
+                tracing::debug!(code = code.as_str(), %error, "request refused");
+            }
+            _ => {}
         }
         // What broke inside is for the log; a client can do nothing with it.
         let detail = match code {

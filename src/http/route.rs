@@ -39,7 +39,8 @@ pub struct Route {
 pub enum Scope {
     /// Anyone, without a key and without a bound on the rate.
     Public,
-    /// Anyone, unless the settings protect the metrics: then a key that may read is needed.
+    /// Anyone, unless the settings protect the metrics: then a key is needed, of any role. With a key
+    /// the metrics name its maps.
     Metrics,
     /// Holders of a key with this role, or anyone if the server has no keys. Their rate is bounded,
     /// and what they ask for needs the pipeline.
@@ -169,12 +170,11 @@ impl Route {
 }
 
 impl Scope {
-    /// The role that a caller's key needs; `None` if anyone may call. `protect_metrics` is the
-    /// setting of that name.
-    pub fn required_role(self, protect_metrics: bool) -> Option<Role> {
+    /// The role that a key needs which is presented; `None` if nobody looks at it.
+    pub fn role(self) -> Option<Role> {
         match self {
             Self::Public => None,
-            Self::Metrics => protect_metrics.then_some(Role::Read),
+            Self::Metrics => Some(Role::Metrics),
             Self::Key(role) => Some(role),
         }
     }

@@ -1,19 +1,19 @@
 //! What all handlers share.
 
-use super::api_keys::ApiKeys;
+use super::auth::Auth;
 use super::codec::CodecThreads;
 use super::config::{AuthConfig, HttpConfig};
 use super::cross_origin::CrossOriginRules;
+use super::failed_keys::FailedKeys;
 use super::memory_budget::{BufferKind, MemoryBudget};
 use super::problem::ApiError;
-use super::rate_limits::RateLimits;
 use crate::ops::metrics::Rejection;
 use crate::ops::{Health, Metrics};
 use crate::pipeline::Service;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::InvalidValue;
 use std::ops::Deref;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 use tokio_util::sync::CancellationToken;
 
 /// Bytes of answers of `/metrics` kept in memory at once, some hundred of them.
@@ -31,10 +31,10 @@ pub struct SharedState {
     pub http: HttpConfig,
     /// Largest image in bytes.
     pub max_image_bytes: usize,
-    /// The keys that are accepted.
-    pub api_keys: ApiKeys,
-    /// How many requests a second each caller may send.
-    pub rate_limits: RateLimits,
+    /// Keys and rates, replaced when their settings change.
+    auth: RwLock<Arc<Auth>>,
+    /// Who presented keys that are not known.
+    pub failed_keys: FailedKeys,
     /// How much memory the bodies of all requests may take together.
     pub body_budget: MemoryBudget,
     /// How much memory answers may take together until their clients have taken them.
@@ -79,8 +79,8 @@ impl AppState {
         let shared = SharedState {
             service: OnceLock::new(),
             max_image_bytes,
-            api_keys: ApiKeys::new(auth)?,
-            rate_limits: RateLimits::new(auth, metrics.clone()),
+            auth: RwLock::new(Arc::new(Auth::new(auth, metrics.clone())?)),
+            failed_keys: FailedKeys::new(metrics.clone()),
             body_budget: budget(BufferKind::Bodies, http.max_buffered_bytes),
             answer_budget: budget(BufferKind::Answers, http.max_unsent_bytes),
             metrics_budget: budget(BufferKind::Answers, MAX_UNSENT_METRICS_BYTES),
@@ -102,6 +102,25 @@ impl AppState {
         // Readiness comes last: a client that is told that the server is ready must not have its
         // next request refused.
         self.health.serving();
+    }
+
+    /// The keys and rates in force.
+    pub fn auth(&self) -> Arc<Auth> {
+        // The lock is held for one assignment only, which leaves the value whole.
+        let auth = self.auth.read().unwrap_or_else(PoisonError::into_inner);
+        auth.clone()
+    }
+
+    /// Puts other keys and rates in force, from the next request on; false if nothing has changed.
+    ///
+    /// # Errors
+    /// They are not valid, or would open the service to everyone; the old ones stay in force.
+    pub fn renew_auth(&self, config: &AuthConfig) -> Result<bool, InvalidValue> {
+        let Some(renewed) = self.auth().renewed(config)? else {
+            return Ok(false);
+        };
+        *self.auth.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(renewed);
+        Ok(true)
     }
 
     /// The service, if start-up is through.

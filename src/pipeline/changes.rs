@@ -1,7 +1,7 @@
 //! Changing and deleting references and maps, in the store and in the index together.
 
 use super::maps::Change;
-use super::{PipelineError, Service};
+use super::{Caller, PipelineError, Service};
 use placeformer_core::types::{Calibration, MapName, Reference, ReferenceId};
 use placeformer_store::{ReferencePatch, StoreError};
 use std::sync::Arc;
@@ -13,12 +13,13 @@ impl Service {
     /// The metadata is too long, there is no such reference, or the store fails.
     pub async fn update(
         self: &Arc<Self>,
+        caller: &Caller,
         id: ReferenceId,
         patch: ReferencePatch,
     ) -> Result<Reference, PipelineError> {
         let metadata = patch.metadata.as_ref().and_then(Option::as_ref);
         self.check_metadata(metadata)?;
-        self.write(move |service| service.update_now(id, patch))
+        self.write(caller, move |service| service.update_now(id, patch))
             .await
     }
 
@@ -26,16 +27,25 @@ impl Service {
     ///
     /// # Errors
     /// There is no such reference, or the store fails.
-    pub async fn delete(self: &Arc<Self>, id: ReferenceId) -> Result<Reference, PipelineError> {
-        self.write(move |service| service.delete_now(id)).await
+    pub async fn delete(
+        self: &Arc<Self>,
+        caller: &Caller,
+        id: ReferenceId,
+    ) -> Result<Reference, PipelineError> {
+        self.write(caller, move |service| service.delete_now(id))
+            .await
     }
 
     /// Deletes a map with everything in it; returns how many references that were.
     ///
     /// # Errors
     /// There is no such map, or the store fails.
-    pub async fn delete_map(self: &Arc<Self>, name: MapName) -> Result<u64, PipelineError> {
-        self.write(move |service| service.delete_map_now(&name))
+    pub async fn delete_map(
+        self: &Arc<Self>,
+        caller: &Caller,
+        name: MapName,
+    ) -> Result<u64, PipelineError> {
+        self.write(caller, move |service| service.delete_map_now(&name))
             .await
     }
 
@@ -46,11 +56,14 @@ impl Service {
     /// the store fails.
     pub async fn set_calibration(
         self: &Arc<Self>,
+        caller: &Caller,
         name: MapName,
         calibration: Option<Calibration>,
     ) -> Result<(), PipelineError> {
-        self.write(move |service| service.set_calibration_now(&name, calibration))
-            .await
+        self.write(caller, move |service| {
+            service.set_calibration_now(&name, calibration)
+        })
+        .await
     }
 
     fn update_now(
@@ -129,8 +142,9 @@ impl Service {
     /// its end, because store and index change together.
     async fn write<T: Send + 'static>(
         self: &Arc<Self>,
+        caller: &Caller,
         work: impl FnOnce(&Self) -> Result<T, PipelineError> + Send + 'static,
     ) -> Result<T, PipelineError> {
-        self.run_limited(&self.store_writes, work).await
+        self.run_limited(&self.store_writes, caller, work).await
     }
 }

@@ -10,10 +10,13 @@ use utoipa::ToSchema;
 #[serde(default, deny_unknown_fields)]
 pub struct PipelineConfig {
     /// Queries that may wait for the model or be computed at once; as many new references may,
-    /// besides. Beyond, a request is answered 503 overloaded.
+    /// besides. One caller (a key, or an address where there are no keys) may fill these places.
+    /// As many again are kept for callers that hold less than their share. Beyond, a request is
+    /// answered 503 overloaded.
     pub queue_capacity: usize,
-    /// Longest time in milliseconds that a query may wait for the model. One that would wait longer
-    /// is answered 503 overloaded at once.
+    /// Longest time in milliseconds that a query may wait for the model. Callers are served in turn,
+    /// so that this depends on how many queries of its own caller are ahead of it. One that would
+    /// wait longer is answered 503 overloaded at once.
     pub max_wait_ms: u64,
     /// Listings and look-ups that read the store at once. It is at least two fewer than
     /// store.readers, so that queries and changes always find a connection. One that has to wait

@@ -8,6 +8,8 @@
 
 use super::admission::Ticket;
 use super::blocking::{Panicked, blocking};
+use super::caller::Caller;
+use super::fair::{FairPermit, FairSemaphore};
 use super::{DescriptorSource, PipelineError, Timings};
 use crate::ops::{Metrics, PipelineStage};
 use bytes::Bytes;
@@ -16,7 +18,6 @@ use placeformer_vision::image::ImageConfig;
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Instant;
-use tokio::sync::{Mutex, OwnedMutexGuard, Semaphore};
 use tokio::time::timeout;
 
 /// What errors call the computation of a descriptor.
@@ -36,20 +37,19 @@ pub(super) struct Extraction {
     source: Arc<dyn DescriptorSource>,
     image: Arc<ImageConfig>,
     /// Decoders at work: one per core, so that a burst of images does not starve the model.
-    decoders: Arc<Semaphore>,
-    /// The one compute worker. The first to wait is the first to be served, and a request that is
-    /// dropped while it waits leaves the queue.
-    worker: Arc<Mutex<()>>,
-    /// Locked by the one reference that waits for the worker; the others wait for this lock, so
-    /// that a query never waits for more than one of them.
-    ingest: Arc<Mutex<()>>,
+    decoders: FairSemaphore,
+    /// The one compute worker.
+    worker: FairSemaphore,
+    /// Held by the one reference that waits for the worker, behind the queries; the others wait
+    /// for this, so that a query never waits for more than one of them.
+    ingest: FairSemaphore,
     metrics: Arc<Metrics>,
 }
 
 /// The right to use the compute worker; given back when dropped.
 struct WorkerPermit {
-    _worker: OwnedMutexGuard<()>,
-    _ingest: Option<OwnedMutexGuard<()>>,
+    _worker: FairPermit,
+    _ingest: Option<FairPermit>,
 }
 
 impl Purpose {
@@ -90,9 +90,9 @@ impl Extraction {
         Self {
             source,
             image: Arc::new(image),
-            decoders: Arc::new(Semaphore::new(cores)),
-            worker: Arc::default(),
-            ingest: Arc::default(),
+            decoders: FairSemaphore::new(cores),
+            worker: FairSemaphore::new(1),
+            ingest: FairSemaphore::new(1),
             metrics,
         }
     }
@@ -115,7 +115,7 @@ impl Extraction {
         let tensor = self.decode(bytes, purpose, ticket, timings).await?;
 
         let waiting_since = Instant::now();
-        let permit = self.worker_permit(purpose);
+        let permit = self.worker_permit(purpose, ticket.caller());
         let permit = purpose.within_deadline(EXTRACTION, permit).await?;
         timings.record(&self.metrics, PipelineStage::Queue, waiting_since.elapsed());
         purpose.check_deadline(EXTRACTION)?;
@@ -142,21 +142,26 @@ impl Extraction {
             let decoded = source.decode(&bytes, &config);
             (decoded, started.elapsed())
         });
-        let decoded = purpose.within_deadline("decoding", decoding).await??;
+        let decoded = purpose.within_deadline("decoding", decoding).await?;
         let (decoded, took) = decoded.map_err(|_| PipelineError::DecoderPanicked)?;
         timings.record(&self.metrics, PipelineStage::Decode, took);
         Ok(decoded?)
     }
 
     /// Waits for the compute worker; at most one reference waits for it among the queries.
-    async fn worker_permit(&self, purpose: Purpose) -> WorkerPermit {
-        let ingest = match purpose {
-            Purpose::Ingest => Some(self.ingest.clone().lock_owned().await),
-            Purpose::Answer(_) => None,
-        };
-        WorkerPermit {
-            _worker: self.worker.clone().lock_owned().await,
-            _ingest: ingest,
+    async fn worker_permit(&self, purpose: Purpose, caller: &Caller) -> WorkerPermit {
+        match purpose {
+            Purpose::Ingest => {
+                let ingest = self.ingest.acquire(caller).await;
+                WorkerPermit {
+                    _worker: self.worker.acquire_behind().await,
+                    _ingest: Some(ingest),
+                }
+            }
+            Purpose::Answer(_) => WorkerPermit {
+                _worker: self.worker.acquire(caller).await,
+                _ingest: None,
+            },
         }
     }
 
@@ -186,16 +191,14 @@ impl Extraction {
         &self,
         ticket: &Arc<Ticket>,
         work: impl FnOnce() -> T + Send + 'static,
-    ) -> Result<Result<T, Panicked>, PipelineError> {
-        let permit = self.decoders.clone().acquire_owned().await;
-        // The semaphore is never closed.
-        let permit = permit.map_err(|_| PipelineError::ShuttingDown)?;
+    ) -> Result<T, Panicked> {
+        let permit = self.decoders.acquire(ticket.caller()).await;
         let ticket = ticket.clone();
         let outcome = blocking(move || {
             let outcome = work();
             drop((permit, ticket));
             outcome
         });
-        Ok(outcome.await)
+        outcome.await
     }
 }

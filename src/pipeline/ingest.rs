@@ -3,7 +3,7 @@
 use super::admission::Ticket;
 use super::blocking::blocking;
 use super::extraction::Purpose;
-use super::{PipelineError, Service, Timings};
+use super::{Caller, PipelineError, Service, Timings};
 use crate::ops::PipelineStage;
 use crate::ops::metrics::Rejection;
 use bytes::Bytes;
@@ -48,6 +48,7 @@ impl Service {
     /// external id names another image; the store fails.
     pub async fn ingest(
         self: &Arc<Self>,
+        caller: &Caller,
         request: IngestRequest,
     ) -> Result<IngestAnswer, PipelineError> {
         self.may_store()?;
@@ -56,10 +57,10 @@ impl Service {
         if let Some(live) = self.maps.live(&request.map) {
             live.check_model(&request.map, &model)?;
         }
-        let ticket = Arc::new(self.references.admit(Duration::MAX)?);
+        let ticket = Arc::new(self.references.admit(caller, Duration::MAX)?);
 
         let content_hash = self.hash(request.image.clone(), &ticket).await?;
-        if let Some(reference) = self.already_stored(&request, content_hash).await? {
+        if let Some(reference) = self.already_stored(caller, &request, content_hash).await? {
             return Ok(IngestAnswer {
                 reference,
                 created: false,
@@ -97,7 +98,7 @@ impl Service {
         let hashed = self
             .extraction
             .on_decoder_thread(ticket, move || ContentHash::of(&image))
-            .await?;
+            .await;
         hashed.map_err(|_| PipelineError::Panicked { stage: "hashing" })
     }
 
@@ -108,6 +109,7 @@ impl Service {
     /// The external id names another image, or the store fails.
     async fn already_stored(
         self: &Arc<Self>,
+        caller: &Caller,
         request: &IngestRequest,
         content_hash: ContentHash,
     ) -> Result<Option<Reference>, PipelineError> {
@@ -115,7 +117,8 @@ impl Service {
             return Ok(None);
         };
         let map = request.map.clone();
-        match self.find_external(map.clone(), external_id.clone()).await {
+        let finding = self.find_external(caller, map.clone(), external_id.clone());
+        match finding.await {
             Ok(Some(reference)) if reference.content_hash == content_hash => {
                 // One whose commit could not be acknowledged is stored, but not in the index: it is
                 // described again, and indexed.

@@ -10,14 +10,15 @@
 //! journal, from which the new index catches up.
 
 use super::PipelineError;
-use placeformer_core::types::{Calibration, Descriptor, GeoPoint, MapName, ModelId, ReferenceId};
+use placeformer_core::types::{
+    Calibration, Descriptor, GeoPoint, MapName, ModelId, ReferenceId, Timestamp,
+};
 use placeformer_store::{GlobalRow, StoreError};
 use placeformer_vision::extract::Head;
 use placeformer_vision::search::{IndexEntry, MapIndex};
 use std::borrow::Cow;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
-use time::OffsetDateTime;
 
 /// All maps by name.
 #[derive(Default)]
@@ -37,7 +38,7 @@ pub(super) struct MapEntry {
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Change {
     /// Another location or capture time.
-    Moved(ReferenceId, Option<GeoPoint>, Option<OffsetDateTime>),
+    Moved(ReferenceId, Option<GeoPoint>, Option<Timestamp>),
     /// No longer there.
     Deleted(ReferenceId),
 }

@@ -3,7 +3,7 @@
 use super::admission::Ticket;
 use super::blocking::blocking;
 use super::extraction::Purpose;
-use super::{PipelineError, Service, Timings};
+use super::{Caller, PipelineError, Service, Timings};
 use crate::ops::PipelineStage;
 use bytes::Bytes;
 use placeformer_core::types::{Deadline, ImageSize, ModelId, PackedPatches, ReferenceId};
@@ -61,16 +61,18 @@ impl Service {
     /// full, or the time is up.
     pub async fn match_images(
         self: &Arc<Self>,
+        caller: &Caller,
         query: Bytes,
         target: MatchTarget,
     ) -> Result<MatchAnswer, PipelineError> {
-        let outcome = self.match_in_time(query, target).await;
+        let outcome = self.match_in_time(caller, query, target).await;
         self.count_if_late(&outcome);
         outcome
     }
 
     async fn match_in_time(
         self: &Arc<Self>,
+        caller: &Caller,
         query: Bytes,
         target: MatchTarget,
     ) -> Result<MatchAnswer, PipelineError> {
@@ -78,10 +80,12 @@ impl Service {
         let purpose = Purpose::Answer(Deadline::after(time));
         // The store is read before a place in the queue is taken, which others wait for.
         let target = match target {
-            MatchTarget::Reference(id) => LoadedTarget::Patches(self.stored_patches(id).await?),
+            MatchTarget::Reference(id) => {
+                LoadedTarget::Patches(self.stored_patches(caller, id).await?)
+            }
             MatchTarget::Image(bytes) => LoadedTarget::Image(bytes),
         };
-        let ticket = Arc::new(self.queries.admit(self.max_wait())?);
+        let ticket = Arc::new(self.queries.admit(caller, self.max_wait())?);
 
         let mut timings = Timings::default();
         let query = self
@@ -122,10 +126,11 @@ impl Service {
     /// The key patches of a reference, if they can be compared with this server's.
     async fn stored_patches(
         self: &Arc<Self>,
+        caller: &Caller,
         id: ReferenceId,
     ) -> Result<Arc<PackedPatches>, PipelineError> {
-        let map = self.reference(id).await?.map;
-        self.run_limited(&self.store_reads, move |service| {
+        let map = self.reference(caller, id).await?.map;
+        self.run_limited(&self.store_reads, caller, move |service| {
             let (_, live) = service.existing(&map)?;
             live.check_model(&map, service.extraction.source().model_id())?;
             Ok(service.patches.load(&*service.store, id)?)

@@ -4,7 +4,8 @@
 //! paths lead through it: [`Service::ingest`], [`Service::query`] and [`Service::match_images`].
 //! Each takes a place in a bounded queue, and is refused at once if the queue is full. It then
 //! decodes the image off the async threads, waits for the one compute worker, and finishes in a
-//! blocking task. A caller that goes away drops its future, and with it everything that has not
+//! blocking task. Wherever requests wait, callers take turns, so that one that sends many does not
+//! keep the others from being answered. A caller that goes away drops its future, and with it everything that has not
 //! begun; blocking work that has begun keeps its place in the queue and its permit until it ends.
 //!
 //! The store is the truth and the index is a cache of it. A reference enters the index only after
@@ -17,6 +18,7 @@
 //! | `changes`, `rehead` | changing and deleting references and maps; another head for a map |
 //! | `service`, `startup` | the state they share, and how it is built from the store |
 //! | `extraction` | decoding and the compute worker |
+//! | `caller`, `fair` | who a request is from; permits for which callers take turns |
 //! | `admission`, `blocking` | bounds on waiting and on threads |
 //! | `maps`, `patches` | index and locks of each map; cache of key patches |
 //! | `calibrations` | how far the best answer can be trusted |
@@ -24,10 +26,12 @@
 mod admission;
 mod blocking;
 mod calibrations;
+mod caller;
 mod changes;
 mod config;
 mod error;
 mod extraction;
+mod fair;
 mod ingest;
 mod maps;
 mod match_images;
@@ -40,6 +44,7 @@ mod startup;
 mod timings;
 
 pub use calibrations::MatchConfidence;
+pub use caller::{Caller, network_of};
 pub use config::PipelineConfig;
 pub use error::PipelineError;
 pub use ingest::{IngestAnswer, IngestRequest};

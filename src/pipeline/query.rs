@@ -10,7 +10,7 @@ use super::blocking::blocking;
 use super::calibrations::BestAnswer;
 use super::extraction::Purpose;
 use super::maps::LiveMap;
-use super::{MatchConfidence, PipelineError, Service, Timings};
+use super::{Caller, MatchConfidence, PipelineError, Service, Timings};
 use crate::ops::PipelineStage;
 use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
@@ -115,25 +115,29 @@ impl Service {
     /// refused; the queue is full or the time is up; the store fails.
     pub async fn query(
         self: &Arc<Self>,
+        caller: &Caller,
         request: QueryRequest,
     ) -> Result<QueryAnswer, PipelineError> {
-        let outcome = self.query_in_time(request).await;
+        let outcome = self.query_in_time(caller, request).await;
         self.count_if_late(&outcome);
         outcome
     }
 
     async fn query_in_time(
         self: &Arc<Self>,
+        caller: &Caller,
         request: QueryRequest,
     ) -> Result<QueryAnswer, PipelineError> {
         let plan = match self.plan(request.map, request.options) {
-            Err(PipelineError::MapNotFound(map)) => return Err(self.explain_missing(map).await),
+            Err(PipelineError::MapNotFound(map)) => {
+                return Err(self.explain_missing(caller, map).await);
+            }
             plan => plan?,
         };
         let purpose = Purpose::Answer(plan.deadline);
         purpose.check_deadline("decoding")?;
         let max_wait = plan.deadline.remaining().min(self.max_wait());
-        let ticket = Arc::new(self.queries.admit(max_wait)?);
+        let ticket = Arc::new(self.queries.admit(caller, max_wait)?);
 
         let mut timings = Timings::default();
         let descriptor = self
@@ -175,8 +179,8 @@ impl Service {
     }
 
     /// Asks the store why a map cannot be searched.
-    async fn explain_missing(self: &Arc<Self>, map: MapName) -> PipelineError {
-        let asking = self.run_limited(&self.store_reads, move |service| {
+    async fn explain_missing(self: &Arc<Self>, caller: &Caller, map: MapName) -> PipelineError {
+        let asking = self.run_limited(&self.store_reads, caller, move |service| {
             Ok(service.missing_map(&map))
         });
         asking.await.unwrap_or_else(|error| error)

@@ -7,7 +7,7 @@
 //! with, so no answer mixes two heads.
 
 use super::maps::{Change, LiveMap, MapEntry, Projection, index_entry};
-use super::{PipelineError, Service};
+use super::{Caller, PipelineError, Service};
 use bytes::Bytes;
 use placeformer_core::types::{MapName, ModelId};
 use placeformer_store::{GlobalRow, HeadExchange, MapInfo, NewHead, StoreError};
@@ -29,11 +29,12 @@ impl Service {
     /// backbone; another head is being prepared; disk or memory is short; the store fails.
     pub async fn set_head(
         self: &Arc<Self>,
+        caller: &Caller,
         map: MapName,
         file: Option<Bytes>,
     ) -> Result<MapInfo, PipelineError> {
         self.may_store()?;
-        self.run_limited(&self.heads, move |service| {
+        self.run_limited(&self.heads, caller, move |service| {
             service.set_head_now(&map, file.as_deref())
         })
         .await

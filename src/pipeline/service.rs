@@ -7,14 +7,15 @@ use super::calibrations::Calibrations;
 use super::extraction::Extraction;
 use super::maps::{Change, LiveMap, MapEntry, Maps};
 use super::patches::PatchCache;
-use super::{PipelineConfig, PipelineError};
+use super::{Caller, PipelineConfig, PipelineError};
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::metrics::{MemoryComponent, Rejection};
 use crate::ops::{Health, Metrics};
 use placeformer_core::types::{
-    Calibration, ExternalId, ImageSize, InvalidValue, MapName, ModelId, Reference, ReferenceId,
+    Calibration, ExternalId, ImageSize, InvalidValue, MapName, Metadata, ModelId, Reference,
+    ReferenceId,
 };
-use placeformer_store::{MapInfo, Page, PlaceStore, StoreError};
+use placeformer_store::{Cursor, MapInfo, Page, PlaceStore, StoreError};
 use placeformer_vision::rerank::{RerankConfig, Reranker};
 use std::sync::Arc;
 use std::time::Duration;
@@ -85,8 +86,24 @@ impl Service {
     ///
     /// # Errors
     /// There is no such reference, or the store is busy or fails.
-    pub async fn reference(self: &Arc<Self>, id: ReferenceId) -> Result<Reference, PipelineError> {
-        self.read(move |store| store.get(id)).await
+    pub async fn reference(
+        self: &Arc<Self>,
+        caller: &Caller,
+        id: ReferenceId,
+    ) -> Result<Reference, PipelineError> {
+        self.read(caller, move |store| store.get(id)).await
+    }
+
+    /// The map that a reference is of, also if the reference itself is damaged.
+    ///
+    /// # Errors
+    /// There is no such reference, or the store is busy or fails.
+    pub async fn map_of(
+        self: &Arc<Self>,
+        caller: &Caller,
+        id: ReferenceId,
+    ) -> Result<MapName, PipelineError> {
+        self.read(caller, move |store| store.map_of(id)).await
     }
 
     /// The reference to which a map builder gave this external id, if there is one.
@@ -95,24 +112,26 @@ impl Service {
     /// There is no such map, or the store is busy or fails.
     pub async fn find_external(
         self: &Arc<Self>,
+        caller: &Caller,
         map: MapName,
         external_id: ExternalId,
     ) -> Result<Option<Reference>, PipelineError> {
-        self.read(move |store| store.find_external(&map, &external_id))
+        self.read(caller, move |store| store.find_external(&map, &external_id))
             .await
     }
 
-    /// A page of references, ascending by id.
+    /// A page of references, in the order they were added.
     ///
     /// # Errors
     /// There is no such map, or the store is busy or fails.
     pub async fn references(
         self: &Arc<Self>,
+        caller: &Caller,
         map: Option<MapName>,
-        after: Option<ReferenceId>,
+        after: Option<Cursor>,
         limit: usize,
     ) -> Result<Page, PipelineError> {
-        self.read(move |store| store.list(map.as_ref(), after, limit))
+        self.read(caller, move |store| store.list(map.as_ref(), after, limit))
             .await
     }
 
@@ -120,16 +139,20 @@ impl Service {
     ///
     /// # Errors
     /// The store is busy or fails.
-    pub async fn maps(self: &Arc<Self>) -> Result<Vec<MapInfo>, PipelineError> {
-        self.read(|store| store.maps()).await
+    pub async fn maps(self: &Arc<Self>, caller: &Caller) -> Result<Vec<MapInfo>, PipelineError> {
+        self.read(caller, |store| store.maps()).await
     }
 
     /// One map.
     ///
     /// # Errors
     /// There is no such map, or the store is busy or fails.
-    pub async fn map(self: &Arc<Self>, name: MapName) -> Result<MapInfo, PipelineError> {
-        self.read(move |store| store.map(&name)).await
+    pub async fn map(
+        self: &Arc<Self>,
+        caller: &Caller,
+        name: MapName,
+    ) -> Result<MapInfo, PipelineError> {
+        self.read(caller, move |store| store.map(&name)).await
     }
 
     /// Refuses new references while the storage is lost, or disk or memory is short. Deleting is
@@ -175,14 +198,8 @@ impl Service {
     }
 
     /// Bounds the metadata of a reference.
-    pub(super) fn check_metadata(
-        &self,
-        metadata: Option<&serde_json::Map<String, serde_json::Value>>,
-    ) -> Result<(), PipelineError> {
-        let Some(metadata) = metadata else {
-            return Ok(());
-        };
-        let length = serde_json::to_vec(metadata).map_or(usize::MAX, |text| text.len());
+    pub(super) fn check_metadata(&self, metadata: Option<&Metadata>) -> Result<(), PipelineError> {
+        let length = metadata.map_or(0, |metadata| metadata.as_str().len());
         let bound = self.config.max_metadata_bytes;
         if length > bound {
             let reason = format!("{length} bytes of JSON are more than the {bound} allowed");
@@ -233,7 +250,7 @@ impl Service {
 
         let sizes = maps
             .iter()
-            .map(|(name, live)| (name.to_string(), live.index.len() as u64));
+            .map(|(name, live)| (name.clone(), live.index.len() as u64));
         metrics.set_references(sizes.collect());
     }
 
@@ -300,10 +317,11 @@ impl Service {
     /// permit until it ends.
     async fn read<T: Send + 'static>(
         self: &Arc<Self>,
+        caller: &Caller,
         work: impl FnOnce(&dyn PlaceStore) -> Result<T, StoreError> + Send + 'static,
     ) -> Result<T, PipelineError> {
-        self.run_limited(&self.store_reads, |service| Ok(work(&*service.store)?))
-            .await
+        let reading = move |service: &Self| Ok(work(&*service.store)?);
+        self.run_limited(&self.store_reads, caller, reading).await
     }
 
     /// Runs `work` on a blocking thread once `limit` allows, and follows the damage it found.
@@ -313,9 +331,10 @@ impl Service {
     pub(super) async fn run_limited<T: Send + 'static>(
         self: &Arc<Self>,
         limit: &ConcurrencyLimit,
+        caller: &Caller,
         work: impl FnOnce(&Self) -> Result<T, PipelineError> + Send + 'static,
     ) -> Result<T, PipelineError> {
-        let permit = limit.acquire(self.max_wait()).await?;
+        let permit = limit.acquire(caller, self.max_wait()).await?;
         let service = self.clone();
         let outcome = blocking(move || {
             let outcome = work(&service);

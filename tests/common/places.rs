@@ -2,12 +2,11 @@
 
 use half::f16;
 use placeformer_core::types::{
-    ContentHash, Descriptor, ExternalId, GLOBAL_DIM, GeoPoint, Heading, MapName, ModelId,
-    NewReference, PackedPatches, PatchGrid, PoolingStride, ReferenceFields,
+    ContentHash, Descriptor, ExternalId, GLOBAL_DIM, GeoPoint, Heading, MapName, Metadata, ModelId,
+    NewReference, PackedPatches, PatchGrid, PoolingStride, ReferenceFields, Timestamp,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use time::OffsetDateTime;
 
 /// The model of every made-up descriptor unless a test says otherwise.
 pub const MODEL: &str = "test-model";
@@ -57,8 +56,10 @@ pub fn descriptor(seed: u64, patches: usize, dim: usize) -> Descriptor {
 
 /// A reference of `map` drawn from `seed`, without an external id.
 pub fn reference(map: &MapName, seed: u64) -> NewReference {
-    let captured =
-        OffsetDateTime::from_unix_timestamp(1_700_000_000 + seed as i64 % 100_000).unwrap();
+    let seconds = 1_700_000_000 + seed as i64 % 100_000;
+    let captured = Timestamp::from_unix_micros(seconds * 1_000_000).unwrap();
+    let metadata = format!(r#"{{"seed":{seed},"note":"a b"}}"#);
+    let metadata = Metadata::parse(&metadata).unwrap();
     NewReference {
         map: map.clone(),
         fields: ReferenceFields {
@@ -66,9 +67,7 @@ pub fn reference(map: &MapName, seed: u64) -> NewReference {
             location: Some(GeoPoint::new(51.0 + (seed % 1000) as f64 * 1e-4, 7.0).unwrap()),
             heading: Some(Heading::new((seed % 360) as f64).unwrap()),
             captured_at: Some(captured),
-            metadata: serde_json::json!({ "seed": seed, "note": "a b" })
-                .as_object()
-                .cloned(),
+            metadata: Some(metadata),
         },
         content_hash: ContentHash::of(&seed.to_le_bytes()),
         model: ModelId::new(MODEL),

@@ -81,7 +81,7 @@ class Stack:
         environment = dict(os.environ, BINARY=str(self.binary))
         run("docker/build.sh", self.images["placeformer"], env=environment)
         self.images["prometheus"] = self.image_or_package("prom/prometheus:v2.53.5", "prometheus")
-        self.images["haproxy"] = self.image_or_package("haproxy:2.6", "haproxy")
+        self.images["haproxy"] = self.image_or_package("haproxy:2.6.12", "haproxy")
         self.env = dict(
             os.environ,
             PLACEFORMER_IMAGE=self.images["placeformer"],

@@ -16,9 +16,10 @@ fn key(name: &str, role: Role) -> ApiKey {
     let sha256 = hex::encode(hash);
     ApiKey {
         name: name.into(),
-        sha256,
+        sha256: sha256.into(),
         role,
         requests_per_second: None,
+        maps: None,
     }
 }
 

@@ -8,7 +8,7 @@ use placeformer_core::types::{
     Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
 };
 use placeformer_store::{
-    CombinedStore, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, ReadPlaces,
+    CombinedStore, Cursor, GlobalRow, HeadExchange, Inserted, MapInfo, NewHead, Page, ReadPlaces,
     ReferencePatch, SqliteStore, StoreError, WritePlaces,
 };
 use serde_json::json;
@@ -227,7 +227,7 @@ impl ReadPlaces for GatedReading {
     fn list(
         &self,
         map: Option<&MapName>,
-        after: Option<ReferenceId>,
+        after: Option<Cursor>,
         limit: usize,
     ) -> Result<Page, StoreError> {
         self.inner
@@ -237,6 +237,10 @@ impl ReadPlaces for GatedReading {
 
     fn get(&self, id: ReferenceId) -> Result<Reference, StoreError> {
         self.inner.get(id)
+    }
+
+    fn map_of(&self, id: ReferenceId) -> Result<MapName, StoreError> {
+        self.inner.map_of(id)
     }
 
     fn get_many(&self, ids: &[ReferenceId]) -> Result<Vec<Reference>, StoreError> {

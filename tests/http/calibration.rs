@@ -200,9 +200,10 @@ async fn calibrating_needs_a_key_that_may_write() {
     let app = App::with(|config| {
         let key = |name: &str, sha256: &str, role| ApiKey {
             name: name.into(),
-            sha256: sha256.into(),
+            sha256: sha256.to_owned().into(),
             role,
             requests_per_second: None,
+            maps: None,
         };
         // SHA-256 of "secret".
         let hash = "2bb80d537b1da3e38bd30361aa855686bde0eacd7162fef6a25fe97bf527a25b";

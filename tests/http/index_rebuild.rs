@@ -5,11 +5,11 @@ use crate::common::places::{map, named_reference, reference, unit_vector};
 use crate::support::{self, FakeSource, picture};
 use bytes::Bytes;
 use placeformer::config::Config;
-use placeformer::pipeline::{IngestRequest, QueryOptions, QueryRequest, Service};
+use placeformer::pipeline::{Caller, IngestRequest, QueryOptions, QueryRequest, Service};
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{
     ContentHash, GLOBAL_DIM, GeoCircle, GeoPoint, MapName, NewReference, Reference,
-    ReferenceFields, ReferenceFilter, ReferenceId,
+    ReferenceFields, ReferenceFilter, ReferenceId, Timestamp,
 };
 use placeformer_store::{
     Inserted, ReadPlaces, ReferencePatch, SqliteStore, StoreConfig, WritePlaces,
@@ -19,7 +19,6 @@ use proptest::prelude::*;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use time::OffsetDateTime;
 
 // ---------------------------------------------------------------- any history
 
@@ -74,8 +73,8 @@ fn place(place: u8) -> GeoPoint {
     GeoPoint::new(51.0 + f64::from(place) * 1e-3, 7.0).unwrap()
 }
 
-fn minute(minute: u8) -> OffsetDateTime {
-    OffsetDateTime::from_unix_timestamp(1_700_000_000 + 60 * i64::from(minute)).unwrap()
+fn minute(minute: u8) -> Timestamp {
+    Timestamp::from_unix_micros((1_700_000_000 + 60 * i64::from(minute)) * 1_000_000).unwrap()
 }
 
 fn start(directory: &Path) -> Arc<Service> {
@@ -182,7 +181,7 @@ impl History {
                 };
                 let changed = self
                     .runtime
-                    .block_on(self.service().update(id, patch.clone()))
+                    .block_on(self.service().update(&Caller::Local, id, patch.clone()))
                     .unwrap();
                 let expected = self.model.0.get_mut(&id).unwrap();
                 patch.apply(&mut expected.fields);
@@ -192,7 +191,8 @@ impl History {
                 let Some(id) = self.model.pick(which) else {
                     return;
                 };
-                let deleted = self.runtime.block_on(self.service().delete(id)).unwrap();
+                let deleting = self.service().delete(&Caller::Local, id);
+                let deleted = self.runtime.block_on(deleting).unwrap();
                 assert_eq!(Some(deleted), self.model.0.remove(&id));
                 self.gone.push(id);
             }
@@ -200,7 +200,7 @@ impl History {
                 let name = name_of(map);
                 let deleted = self
                     .runtime
-                    .block_on(self.service().delete_map(name.clone()));
+                    .block_on(self.service().delete_map(&Caller::Local, name.clone()));
                 match self.maps.remove(&name) {
                     true => assert_eq!(deleted.unwrap(), self.model.of(&name).len() as u64),
                     false => assert_eq!(deleted.unwrap_err().code(), ErrorCode::MapNotFound),
@@ -226,7 +226,9 @@ impl History {
             fields: fields.clone(),
             image,
         };
-        let answer = self.runtime.block_on(self.service().ingest(request));
+        let answer = self
+            .runtime
+            .block_on(self.service().ingest(&Caller::Local, request));
         match holder {
             Some(holder) if holder.content_hash == content => {
                 let answer = answer.unwrap();
@@ -253,15 +255,22 @@ impl History {
         let service = self.service();
         self.runtime.block_on(async {
             for (id, expected) in &self.model.0 {
-                assert_eq!(service.reference(*id).await.unwrap(), *expected);
+                assert_eq!(
+                    service.reference(&Caller::Local, *id).await.unwrap(),
+                    *expected
+                );
             }
             for id in &self.gone {
                 assert_eq!(
-                    service.reference(*id).await.unwrap_err().code(),
+                    service
+                        .reference(&Caller::Local, *id)
+                        .await
+                        .unwrap_err()
+                        .code(),
                     ErrorCode::ReferenceNotFound
                 );
             }
-            let maps = service.maps().await.unwrap();
+            let maps = service.maps(&Caller::Local).await.unwrap();
             assert_eq!(
                 maps.iter().map(|map| &map.name).collect::<Vec<_>>(),
                 self.maps.iter().collect::<Vec<_>>()
@@ -296,7 +305,7 @@ impl History {
             image: Bytes::from(picture(2)),
             options,
         };
-        let answer = self.service().query(request).await.unwrap();
+        let answer = self.service().query(&Caller::Local, request).await.unwrap();
         let passes = |fields: &ReferenceFields| filter.accepts(fields.location, fields.captured_at);
         let expected = self
             .model
@@ -323,7 +332,10 @@ async fn listed(service: &Arc<Service>, map: Option<MapName>) -> Vec<Reference> 
     let mut all = Vec::new();
     let mut after = None;
     loop {
-        let page = service.references(map.clone(), after, 3).await.unwrap();
+        let page = service
+            .references(&Caller::Local, map.clone(), after, 3)
+            .await
+            .unwrap();
         assert!(page.references.len() == 3 || page.next.is_none());
         all.extend(page.references);
         after = page.next;
@@ -411,7 +423,7 @@ fn assert_equal(a: &MapIndex, b: &MapIndex) {
     let filters = [
         ReferenceFilter::default(),
         ReferenceFilter {
-            captured_after: Some(time::OffsetDateTime::from_unix_timestamp(1_700_000_100).unwrap()),
+            captured_after: Some(Timestamp::from_unix_micros(1_700_000_100_000_000).unwrap()),
             ..ReferenceFilter::default()
         },
     ];

@@ -109,3 +109,26 @@ fn every_line_of_a_request_carries_its_id_whatever_thread_it_comes_from() {
     }
     server.kill();
 }
+
+#[test]
+fn a_deadline_that_passes_is_no_error_in_the_log() {
+    let directory = Arc::new(tempfile::tempdir().unwrap());
+    tokio::runtime::Runtime::new().unwrap().block_on(async {
+        let app = App::open(directory.clone(), source(), |_| {});
+        app.post_png("/references?map=m", 1).await.created();
+    });
+    let logs = tempfile::tempdir().unwrap();
+    let log = logs.path().join("log");
+    let server = Server::start_logged(directory.path(), &log);
+    let is_late = |seed: &u64| {
+        let (status, answer) = server
+            .post("/query?map=m&deadline_ms=1", picture(*seed))
+            .unwrap();
+        assert!(matches!(status, 200 | 504), "{answer}");
+        status == 504
+    };
+    assert!((0..500).any(|seed| is_late(&seed)), "a millisecond was always enough");
+    for line in lines(&log) {
+        assert!(line["level"] == "INFO" || line["level"] == "DEBUG", "{line}");
+    }
+}

@@ -2,7 +2,7 @@
 //! serves.
 
 use crate::support::{BACKBONE, FakeSource, head};
-use placeformer::config::Config;
+use placeformer::config::{Config, Overrides};
 use placeformer::ops::{LogConfig, LogFormat, logging};
 use placeformer::server::{Loaders, run_server};
 use placeformer_store::{SqliteStore, StoreConfig, crash_points};
@@ -24,6 +24,8 @@ const SIGABRT: i32 = 6;
 const DIRECTORY: &str = "PLACEFORMER_TEST_SERVED";
 /// Set: the server logs JSON.
 const LOGGED: &str = "PLACEFORMER_TEST_LOGGED";
+/// A configuration file, which the server follows.
+const CONFIGURED: &str = "PLACEFORMER_TEST_CONFIGURED";
 
 /// The model of the child, to open its store with.
 pub fn source() -> Arc<FakeSource> {
@@ -51,10 +53,11 @@ fn child_that_serves_until_it_is_killed() {
         };
         logging::init(&config).unwrap()
     });
-    let mut config = Config {
-        store: store_config(),
-        ..Config::default()
+    let mut config = match std::env::var_os(CONFIGURED) {
+        Some(file) => Config::load(Some(Path::new(&file)), &Overrides::default()).unwrap(),
+        None => Config::default(),
     };
+    config.store = store_config();
     config.data.directory = directory.into();
     config.pipeline.disk_reserve_bytes = 0;
     let (data, store) = (config.data.directory.clone(), config.store.clone());
@@ -115,6 +118,16 @@ impl Server {
         .unwrap()
     }
 
+    /// As [`Server::start_logged`], with the settings of a file.
+    #[track_caller]
+    pub fn start_configured(directory: &Path, log: &Path, file: &Path) -> Self {
+        let log = std::fs::File::create(log).unwrap();
+        Self::start_with(directory, |command| {
+            command.env(LOGGED, "1").env(CONFIGURED, file).stderr(log);
+        })
+        .unwrap()
+    }
+
     /// A server that is ready, or how it died before it was.
     #[track_caller]
     fn start_with(directory: &Path, change: impl FnOnce(&mut Command)) -> Result<Self, ExitStatus> {
@@ -167,6 +180,20 @@ impl Server {
     /// Status and body; `None` if the server died over it.
     pub fn get(&self, path: &str) -> Option<(u16, Value)> {
         read(self.http.get(format!("{}{path}", self.url)).send())
+    }
+
+    /// The status of an answer to a caller with a key.
+    pub fn get_with_key(&self, path: &str, key: &str) -> u16 {
+        let request = self.http.get(format!("{}{path}", self.url));
+        let answer = request.header("x-api-key", key).send().unwrap();
+        answer.status().as_u16()
+    }
+
+    /// SIGHUP.
+    pub fn hang_up(&self) {
+        let pid = self.child.lock().unwrap().id().to_string();
+        let sent = Command::new("kill").args(["-HUP", &pid]).status().unwrap();
+        assert!(sent.success());
     }
 
     /// An answer that is not JSON.

@@ -332,9 +332,10 @@ async fn giving_a_head_needs_a_key_that_may_write() {
         let sha256 = "2bb80d537b1da3e38bd30361aa855686bde0eacd7162fef6a25fe97bf527a25b".to_owned();
         config.auth.keys = vec![ApiKey {
             name: "fleet".into(),
-            sha256,
+            sha256: sha256.into(),
             role: Role::Read,
             requests_per_second: None,
+            maps: None,
         }];
     });
     for method in ["PUT", "DELETE"] {

@@ -50,9 +50,10 @@ fn api_key(name: &str, role: Role) -> ApiKey {
     let hash = sha2::Sha256::digest(format!("key of {name}"));
     ApiKey {
         name: name.into(),
-        sha256: hash.iter().map(|byte| format!("{byte:02x}")).collect(),
+        sha256: hex::encode(hash).into(),
         role,
         requests_per_second: None,
+        maps: None,
     }
 }
 
@@ -88,7 +89,9 @@ async fn every_route_asks_for_the_key_of_its_scope() {
             let name = name_of(&route.method, route.path);
             let expected = match (route.scope, protect_metrics) {
                 (Scope::Public, _) | (Scope::Metrics, false) => [false, false, false],
-                (Scope::Key(Role::Read), _) | (Scope::Metrics, true) => [true, false, false],
+                (Scope::Key(Role::Metrics | Role::Read), _) | (Scope::Metrics, true) => {
+                    [true, false, false]
+                }
                 (Scope::Key(Role::Write), _) => [true, true, false],
             };
             let mut refused = [false; 3];

@@ -20,7 +20,7 @@ fn read(file: &str) -> String {
 fn exposition() -> String {
     let metrics = Metrics::new().expect("every series registers");
     metrics.expect_route("/query", "POST", [200]);
-    metrics.render().expect("every series renders")
+    metrics.render(|_| true).expect("every series renders")
 }
 
 /// The expressions of the dashboard (panels and annotations) and of the alert rules, with the file
@@ -159,4 +159,63 @@ fn a_renamed_series_or_reason_is_noticed() {
         ),
         Vec::<String>::new()
     );
+}
+
+/// The services of a Compose file: each name with the lines below it.
+fn services(file: &str) -> Vec<(String, String)> {
+    let text = read(file);
+    let mut services: Vec<(String, String)> = Vec::new();
+    let mut section = "";
+    for line in text.lines().filter(|line| !line.trim_start().starts_with('#')) {
+        let indent = line.len() - line.trim_start().len();
+        match indent {
+            0 if !line.is_empty() => section = line,
+            2 if section == "services:" => {
+                let name = line.trim().trim_end_matches(':').to_owned();
+                services.push((name, String::new()));
+            }
+            _ if section == "services:" => {
+                if let Some((_, lines)) = services.last_mut() {
+                    lines.push_str(line);
+                    lines.push('\n');
+                }
+            }
+            _ => {}
+        }
+    }
+    services
+}
+
+#[test]
+fn compose_asks_for_the_password_of_grafana_and_limits_every_service() {
+    let files = ["compose.yaml", "compose.grafana.yaml", "compose.replicas.yaml"];
+    let mut images = 0;
+    for file in files {
+        for (name, lines) in services(file) {
+            let is_addition = name == "placeformer" && file != "compose.yaml";
+            let has = |text: &str| lines.contains(text) || lines.contains("<<: *replica");
+            for limit in ["cpus:", "mem_limit:", "pids_limit:"] {
+                assert!(is_addition || has(limit), "{file}: {name} has no {limit}");
+            }
+            let Some(image) = lines.lines().find_map(|line| line.trim().strip_prefix("image: ")) else {
+                continue;
+            };
+            images += 1;
+            // ${VARIABLE:-name:version}: an exact version has three numbers.
+            let version = image.rsplit(':').next().unwrap().trim_end_matches('}');
+            let numbers = version.trim_start_matches('v').split('.').count();
+            assert!(
+                version == "local" || numbers == 3,
+                "{file}: {image} is no exact version"
+            );
+        }
+    }
+    assert_eq!(images, 4, "placeformer, prometheus, grafana and haproxy");
+    let grafana = read("compose.grafana.yaml");
+    assert!(grafana.contains("GF_SECURITY_ADMIN_PASSWORD: ${GRAFANA_PASSWORD:?"));
+    let replica = read("compose.replicas.yaml");
+    let anchor = replica.split("services:").next().unwrap();
+    for limit in ["cpus:", "mem_limit:", "pids_limit:"] {
+        assert!(anchor.contains(limit), "a replica has no {limit}");
+    }
 }

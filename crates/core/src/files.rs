@@ -1,9 +1,51 @@
 //! Files that are written whole or not at all, and the hashes of files.
 
 use sha2::{Digest, Sha256};
-use std::fs::{self, File};
-use std::io::{self, Write};
+use std::fs::{self, DirBuilder, File, OpenOptions, Permissions};
+use std::io::{self, ErrorKind, Write};
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
+
+/// Who may enter a directory of data: its owner, and its group to read.
+const PRIVATE_DIRECTORY: u32 = 0o750;
+
+/// Who may open a file of data: its owner, and its group to read.
+const PRIVATE_FILE: u32 = 0o640;
+
+/// Makes a directory, and those above it, that others than its owner and its group cannot enter,
+/// whatever the umask says. One that is there stays as it is: its owner decided that.
+///
+/// # Errors
+/// The system refuses.
+pub fn create_private_directory(path: &Path) -> io::Result<()> {
+    if path.is_dir() {
+        return Ok(());
+    }
+    if let Some(above) = path.parent() {
+        fs::create_dir_all(above)?;
+    }
+    match DirBuilder::new().mode(PRIVATE_DIRECTORY).create(path) {
+        // The umask may have taken more than it should.
+        Ok(()) => fs::set_permissions(path, Permissions::from_mode(PRIVATE_DIRECTORY)),
+        Err(error) if error.kind() == ErrorKind::AlreadyExists && path.is_dir() => Ok(()),
+        Err(error) => Err(error),
+    }
+}
+
+/// Makes an empty file that others than its owner and its group cannot read, whatever the umask
+/// says. One that is there stays as it is.
+///
+/// # Errors
+/// The system refuses.
+pub fn create_private_file(path: &Path) -> io::Result<()> {
+    let mut options = OpenOptions::new();
+    options.write(true).create_new(true).mode(PRIVATE_FILE);
+    match options.open(path) {
+        Ok(file) => file.set_permissions(Permissions::from_mode(PRIVATE_FILE)),
+        Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(()),
+        Err(error) => Err(error),
+    }
+}
 
 /// SHA-256 of a file in lower-case hexadecimal. The file is streamed, not loaded whole.
 ///
@@ -93,6 +135,25 @@ mod tests {
         assert!(write_atomically(&path, b"new").is_err());
         assert!(path.join("inside").exists());
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn what_is_made_private_has_its_mode_and_what_was_there_keeps_its_own() {
+        let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o7777;
+        let folder = tempfile::tempdir().unwrap();
+        let directory = folder.path().join("a/b");
+        let file = directory.join("c");
+        create_private_directory(&directory).unwrap();
+        create_private_file(&file).unwrap();
+        assert_eq!((mode(&directory), mode(&file)), (0o750, 0o640));
+        fs::write(&file, "kept").unwrap();
+        fs::set_permissions(&directory, Permissions::from_mode(0o700)).unwrap();
+        fs::set_permissions(&file, Permissions::from_mode(0o600)).unwrap();
+        create_private_directory(&directory).unwrap();
+        create_private_file(&file).unwrap();
+        assert_eq!((mode(&directory), mode(&file)), (0o700, 0o600));
+        assert_eq!(fs::read(&file).unwrap(), b"kept");
+        assert!(create_private_directory(&file).is_err());
     }
 
     #[test]

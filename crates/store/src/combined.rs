@@ -6,8 +6,8 @@
 
 use crate::error::StoreError;
 use crate::records::{
-    Damage, Footprint, GlobalRow, Inserted, MapInfo, NewHead, Page, Quarantined, ReferencePatch,
-    VerifyReport,
+    Cursor, Damage, Footprint, GlobalRow, Inserted, MapInfo, NewHead, Page, Quarantined,
+    ReferencePatch, VerifyReport,
 };
 use crate::traits::{HeadExchange, MaintainPlaces, ReadPlaces, WritePlaces};
 use placeformer_core::types::{
@@ -59,10 +59,14 @@ impl ReadPlaces for CombinedStore {
         self.reading.find_external(map, external_id)
     }
 
+    fn map_of(&self, id: ReferenceId) -> Result<MapName, StoreError> {
+        self.reading.map_of(id)
+    }
+
     fn list(
         &self,
         map: Option<&MapName>,
-        after: Option<ReferenceId>,
+        after: Option<Cursor>,
         limit: usize,
     ) -> Result<Page, StoreError> {
         self.reading.list(map, after, limit)

@@ -27,8 +27,8 @@ pub use combined::CombinedStore;
 pub use config::StoreConfig;
 pub use error::{EngineCause, StoreError};
 pub use records::{
-    Damage, Footprint, GlobalRow, Inserted, MapInfo, NewHead, Page, Quarantined, ReferencePatch,
-    VerifyReport,
+    Cursor, Damage, Footprint, GlobalRow, Inserted, MapInfo, NewHead, Page, Quarantined,
+    ReferencePatch, VerifyReport,
 };
 pub use sqlite::{LostTail, SqliteStore};
 pub use traits::{HeadExchange, MaintainPlaces, PlaceStore, ReadPlaces, WritePlaces};

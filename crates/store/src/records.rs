@@ -1,10 +1,11 @@
 //! What goes into a store and comes out of it.
 
 use placeformer_core::types::{
-    Calibration, ExternalId, GeoPoint, Heading, MapName, ModelId, Reference, ReferenceFields,
-    ReferenceId,
+    Calibration, ExternalId, GeoPoint, Heading, InvalidValue, MapName, Metadata, ModelId,
+    Reference, ReferenceFields, ReferenceId, Timestamp,
 };
-use time::OffsetDateTime;
+use std::fmt;
+use std::str::FromStr;
 
 /// What became of an insert.
 #[derive(Debug, Clone, PartialEq)]
@@ -25,7 +26,7 @@ pub struct MapInfo {
     /// References in it, without the quarantined ones.
     pub references: u64,
     /// When it was created.
-    pub created_at: OffsetDateTime,
+    pub created_at: Timestamp,
     /// How far its best answers can be trusted, if that was fitted for this map.
     pub calibration: Option<Calibration>,
 }
@@ -40,16 +41,61 @@ pub struct GlobalRow {
     /// Its location.
     pub location: Option<GeoPoint>,
     /// Its capture time.
-    pub captured_at: Option<OffsetDateTime>,
+    pub captured_at: Option<Timestamp>,
 }
 
-/// One page of references, ascending by id.
+/// One page of references, in the order they were added.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Page {
     /// The references.
     pub references: Vec<Reference>,
     /// Pass as `after` for the next page; absent on the last.
-    pub next: Option<ReferenceId>,
+    pub next: Option<Cursor>,
+}
+
+/// A place in the order in which references were added to a store, whatever map they are of.
+///
+/// It counts and does not measure time. So whoever reads page after page misses nothing that was
+/// added before the last page was read, even if the clock was set back meanwhile; and a place stays
+/// valid when the reference at it is deleted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Cursor(i64);
+
+impl Cursor {
+    /// What its text begins with, so that an id is not taken for one.
+    const PREFIX: &'static str = "at-";
+
+    /// The place of the `number`th reference.
+    pub fn at(number: i64) -> Self {
+        Self(number)
+    }
+
+    /// Which reference is at the place, counted over the life of the store.
+    pub fn number(self) -> i64 {
+        self.0
+    }
+}
+
+impl fmt::Display for Cursor {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}{}", Self::PREFIX, self.0)
+    }
+}
+
+impl FromStr for Cursor {
+    type Err = InvalidValue;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let digits = text.strip_prefix(Self::PREFIX).filter(|digits| {
+            // A parser of numbers would take a sign, too.
+            digits.bytes().all(|byte| byte.is_ascii_digit())
+        });
+        let number = digits.and_then(|digits| digits.parse().ok());
+        number.map(Self).ok_or_else(|| {
+            let reason = "it is not the `next` of a page of this release; start again without it";
+            InvalidValue::new("cursor", reason)
+        })
+    }
 }
 
 /// Fields to change; the outer `None` leaves a field as it is, the inner `None` clears it.
@@ -62,9 +108,9 @@ pub struct ReferencePatch {
     /// New heading.
     pub heading: Option<Option<Heading>>,
     /// New capture time.
-    pub captured_at: Option<Option<OffsetDateTime>>,
+    pub captured_at: Option<Option<Timestamp>>,
     /// New metadata.
-    pub metadata: Option<Option<serde_json::Map<String, serde_json::Value>>>,
+    pub metadata: Option<Option<Metadata>>,
 }
 
 impl ReferencePatch {
@@ -135,4 +181,30 @@ pub struct NewHead {
     /// The bytes of the head's file, which the store keeps with the map. None if the map uses the
     /// head that the server has loaded, so that there is nothing to keep.
     pub file: Option<Vec<u8>>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cursor_survives_its_text_and_nothing_else_is_one() {
+        for number in [0, 1, 17, i64::MAX] {
+            let cursor = Cursor::at(number);
+            assert_eq!(cursor.to_string().parse::<Cursor>(), Ok(cursor));
+        }
+        let id = ReferenceId::generate().to_string();
+        for text in [
+            "",
+            "at-",
+            "at--1",
+            "at-+1",
+            "at-9223372036854775808",
+            "1",
+            "x",
+            id.as_str(),
+        ] {
+            assert!(text.parse::<Cursor>().is_err(), "{text}");
+        }
+    }
 }

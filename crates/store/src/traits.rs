@@ -6,8 +6,8 @@
 
 use crate::error::StoreError;
 use crate::records::{
-    Damage, Footprint, GlobalRow, Inserted, MapInfo, NewHead, Page, Quarantined, ReferencePatch,
-    VerifyReport,
+    Cursor, Damage, Footprint, GlobalRow, Inserted, MapInfo, NewHead, Page, Quarantined,
+    ReferencePatch, VerifyReport,
 };
 use placeformer_core::types::{
     Calibration, ExternalId, MapName, NewReference, PackedPatches, Reference, ReferenceId,
@@ -51,15 +51,21 @@ pub trait ReadPlaces: Send + Sync {
         external_id: &ExternalId,
     ) -> Result<Option<Reference>, StoreError>;
 
-    /// References of a map (or of all maps), ascending by id, starting behind `after`, at most
-    /// `limit`. Damaged ones are left out.
+    /// The map that a reference is of, also if the reference itself is damaged.
+    ///
+    /// # Errors
+    /// The reference does not exist, or its map's record is damaged.
+    fn map_of(&self, id: ReferenceId) -> Result<MapName, StoreError>;
+
+    /// References of a map (or of all maps) in the order they were added, starting behind `after`,
+    /// at most `limit`. Damaged ones are left out.
     ///
     /// # Errors
     /// The map does not exist or its record is damaged.
     fn list(
         &self,
         map: Option<&MapName>,
-        after: Option<ReferenceId>,
+        after: Option<Cursor>,
         limit: usize,
     ) -> Result<Page, StoreError>;
 

@@ -1,7 +1,9 @@
 //! The service as `bench` measures it: the pipeline itself, without HTTP.
 
 use crate::ops::{Health, Metrics};
-use crate::pipeline::{IngestRequest, Parts, PipelineConfig, QueryOptions, QueryRequest, Service};
+use crate::pipeline::{
+    Caller, IngestRequest, Parts, PipelineConfig, QueryOptions, QueryRequest, Service,
+};
 use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt, stream};
 use placeformer_core::types::{MapName, ReferenceFields};
@@ -56,7 +58,8 @@ impl MeasuredService for RunningPipeline {
             image: photo.clone(),
             options: QueryOptions::default(),
         };
-        let answer = self.runtime.block_on(self.service.query(request))?;
+        let querying = self.service.query(&Caller::Local, request);
+        let answer = self.runtime.block_on(querying)?;
         Ok(answer.reranked)
     }
 
@@ -67,7 +70,7 @@ impl MeasuredService for RunningPipeline {
                 fields: ReferenceFields::default(),
                 image,
             };
-            self.service.ingest(request).await
+            self.service.ingest(&Caller::Local, request).await
         };
         let ingest_all = stream::iter(photos.iter().cloned())
             .map(ingest)

@@ -5,12 +5,10 @@
 
 use anyhow::{Context, anyhow, bail, ensure};
 use placeformer_core::geography::{UtmName, UtmZone};
-use placeformer_core::types::{ExternalId, GeoPoint, Heading, ReferenceFields};
+use placeformer_core::types::{ExternalId, GeoPoint, Heading, ReferenceFields, Timestamp};
 use placeformer_vision::image::read_exif;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
-use time::OffsetDateTime;
-use time::format_description::well_known::Rfc3339;
 
 /// What is known of the photos from other sources than their content.
 pub(super) struct Metadata {
@@ -25,7 +23,7 @@ pub(super) struct Metadata {
 struct Row {
     location: Option<GeoPoint>,
     heading: Option<Heading>,
-    captured_at: Option<OffsetDateTime>,
+    captured_at: Option<Timestamp>,
 }
 
 impl Row {
@@ -190,10 +188,7 @@ fn parse_row<'a>(field: &impl Fn(&str) -> Option<&'a str>) -> anyhow::Result<Row
         (None, None) => None,
         _ => bail!("lat and lon must be given both or not at all"),
     };
-    let parse_time = |text: &str| {
-        OffsetDateTime::parse(text, &Rfc3339)
-            .with_context(|| format!("captured_at {text:?} is not an RFC 3339 time"))
-    };
+    let parse_time = |text: &str| text.parse::<Timestamp>().context("captured_at");
     Ok(Row {
         location,
         heading: number("heading")?.map(Heading::new).transpose()?,
@@ -257,7 +252,10 @@ mod tests {
         let fields = metadata.fields("a/b.jpg", id(), b"").unwrap();
         assert_eq!(fields.location, Some(GeoPoint::new(45.5, 12.25).unwrap()));
         assert_eq!(fields.heading.unwrap().degrees(), 270.0);
-        assert_eq!(fields.captured_at.unwrap().unix_timestamp(), 1_779_010_200);
+        assert_eq!(
+            fields.captured_at.unwrap().instant().unix_timestamp(),
+            1_779_010_200
+        );
         // The position comes from the name and the zone given, the heading from the row.
         let fields = metadata
             .fields("@500000@5000000@@@@@@@123@.jpg", id(), b"")

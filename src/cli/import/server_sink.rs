@@ -10,7 +10,6 @@ use reqwest::header::CONTENT_TYPE;
 use reqwest::{Method, RequestBuilder, StatusCode};
 use serde::Deserialize;
 use std::collections::HashMap;
-use time::format_description::well_known::Rfc3339;
 
 /// References listed by one request.
 const PAGE: &str = "1000";
@@ -133,9 +132,8 @@ fn parameters(upload: &Upload) -> Vec<(&'static str, String)> {
     if let Some(heading) = fields.heading {
         parameters.push(("heading", heading.degrees().to_string()));
     }
-    let captured_at = fields.captured_at.map(|time| time.format(&Rfc3339));
-    if let Some(Ok(time)) = captured_at {
-        parameters.push(("captured_at", time));
+    if let Some(time) = fields.captured_at {
+        parameters.push(("captured_at", time.to_string()));
     }
     parameters
 }

@@ -4,12 +4,12 @@ use super::sink::{Outcome, Sent, Sink, Upload};
 use crate::cli::progress::ProgressBars;
 use crate::config::{Config, ModelOverrides, Overrides};
 use crate::ops::{Health, Metrics};
-use crate::pipeline::{IngestRequest, Parts, PipelineError, Service};
+use crate::pipeline::{Caller, IngestRequest, Parts, PipelineError, Service};
 use anyhow::Context;
 use placeformer_core::error::ErrorCode;
-use placeformer_core::types::{MapName, ReferenceId};
+use placeformer_core::types::MapName;
 use placeformer_models::open_extractor;
-use placeformer_store::{Page, SqliteStore};
+use placeformer_store::{Cursor, Page, SqliteStore};
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -57,8 +57,9 @@ impl StoreSink {
         Ok(Self { service, runtime })
     }
 
-    fn page(&self, map: &MapName, after: Option<ReferenceId>) -> Result<Page, PipelineError> {
-        let page = self.service.references(Some(map.clone()), after, PAGE);
+    fn page(&self, map: &MapName, after: Option<Cursor>) -> Result<Page, PipelineError> {
+        let map = Some(map.clone());
+        let page = self.service.references(&Caller::Local, map, after, PAGE);
         self.runtime.block_on(page)
     }
 }
@@ -89,7 +90,8 @@ impl Sink for StoreSink {
     fn send(&self, upload: Upload) -> Sent {
         let Upload { map, fields, image } = upload;
         let request = IngestRequest { map, fields, image };
-        let outcome = match self.runtime.block_on(self.service.ingest(request)) {
+        let ingesting = self.service.ingest(&Caller::Local, request);
+        let outcome = match self.runtime.block_on(ingesting) {
             Ok(answer) if answer.created => Outcome::Created(answer.reference.id.to_string()),
             Ok(answer) => Outcome::Present(answer.reference.id.to_string()),
             Err(error) => Outcome::Refused {

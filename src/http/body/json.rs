@@ -2,18 +2,17 @@
 //!
 //! The images are long, and parsed JSON takes many times the length of its text. So the body is
 //! only looked at first; then the images are decoded straight from its bytes, and only the rest,
-//! which is short, is parsed into values.
+//! which is short, is kept to be parsed.
 
-use super::parts::{BodyParts, MAX_PARAMETER_BYTES, json_error, parameters_too_long};
+use super::parts::{BodyParts, JsonObject, MAX_PARAMETER_BYTES, json_error, parameters_too_long};
 use super::receive::ReceivedBody;
 use crate::http::memory_budget::Reservation;
 use crate::http::problem::ApiError;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde::Deserializer;
-use serde::de::{MapAccess, Visitor};
+use serde::de::{Error, MapAccess, Visitor};
 use serde_json::value::RawValue;
-use serde_json::{Map, Value};
 use std::borrow::Cow;
 use std::collections::HashMap;
 use std::fmt;
@@ -38,16 +37,26 @@ pub(super) fn split_json(
         let image = decode_image(name, value.get(), &mut bytes_in_use, &mut reservation)?;
         images.push((name, image));
     }
-    let mut parameters = Map::new();
-    for (key, value) in members.parameters {
-        let value: Value = serde_json::from_str(value.get()).map_err(json_error)?;
-        parameters.insert(key, value);
-    }
     let parts = BodyParts {
         images,
-        parameters: Some(parameters),
+        parameters: Some(join(&members.parameters)?),
     };
     Ok((parts, reservation))
+}
+
+/// The object of these members alone. Members of one name stay two, so that they are noticed.
+fn join(members: &[(String, &RawValue)]) -> Result<JsonObject, ApiError> {
+    let mut text = String::from("{");
+    for (i, (key, value)) in members.iter().enumerate() {
+        if i > 0 {
+            text.push(',');
+        }
+        text.push_str(&serde_json::to_string(key).map_err(json_error)?);
+        text.push(':');
+        text.push_str(value.get());
+    }
+    text.push('}');
+    JsonObject::new(text.into_bytes())
 }
 
 /// Decodes one image from `json`, the JSON text of its string. Its memory is added to
@@ -117,7 +126,9 @@ impl<'de> Visitor<'de> for MemberVisitor {
         let mut bytes_left = Some(MAX_PARAMETER_BYTES);
         while let Some((key, value)) = entries.next_entry::<String, &RawValue>()? {
             if let Some(&name) = self.names.iter().find(|name| **name == key) {
-                members.images.insert(name, value);
+                if members.images.insert(name, value).is_some() {
+                    return Err(A::Error::duplicate_field(name));
+                }
                 continue;
             }
             let member_bytes = key.len() + value.get().len() + MEMBER_OVERHEAD_BYTES;

@@ -25,11 +25,11 @@ use axum::http::{HeaderMap, Uri, header};
 use bytes::Bytes;
 use json::split_json;
 use multipart::split_multipart;
-use parts::{BodyParts, MAX_PARAMETER_BYTES, json_error};
+use parts::{BodyParts, JsonObject, MAX_PARAMETER_BYTES};
 use placeformer_core::error::ErrorCode;
 use receive::{ReceivedBody, receive};
 use serde::de::DeserializeOwned;
-use serde_json::{Map, Value};
+use serde_json::Value;
 use std::collections::HashMap;
 use utoipa::openapi::RefOr;
 use utoipa::openapi::schema::Schema;
@@ -154,9 +154,7 @@ pub async fn read_json<T: DeserializeOwned + Send + 'static>(
             bytes,
             reservation: _reservation,
         } = received;
-        // Through an object, because a struct would also be read from an array.
-        let object: Map<String, Value> = serde_json::from_slice(&bytes).map_err(json_error)?;
-        serde_json::from_value(Value::Object(object)).map_err(json_error)
+        JsonObject::new(bytes)?.read()
     };
     state.codec.run(Workload::Small, parse).await
 }
@@ -221,16 +219,13 @@ fn hand_over<P: DeserializeOwned>(
 }
 
 /// The parameters from the query string or from the JSON of the body, which may not both have some.
-fn parameters_of<P: DeserializeOwned>(
-    uri: &Uri,
-    json: Option<Map<String, Value>>,
-) -> Result<P, ApiError> {
+fn parameters_of<P: DeserializeOwned>(uri: &Uri, json: Option<JsonObject>) -> Result<P, ApiError> {
     let in_query = uri.query().is_some_and(|query| !query.is_empty());
     match json {
         Some(json) if !json.is_empty() && in_query => Err(ApiError::invalid(
             "parameters are in the query string and in JSON; use one of them",
         )),
-        Some(json) if !in_query => serde_json::from_value(Value::Object(json)).map_err(json_error),
+        Some(json) if !in_query => json.read(),
         _ => read_query(uri),
     }
 }

@@ -1,6 +1,6 @@
 //! Takes a multipart body apart: one part for each image, and parameters in a part named `json`.
 
-use super::parts::{BodyParts, MAX_PARAMETER_BYTES, json_error, parameters_too_long};
+use super::parts::{BodyParts, JsonObject, MAX_PARAMETER_BYTES, parameters_too_long};
 use super::receive::ReceivedBody;
 use crate::http::memory_budget::Reservation;
 use crate::http::problem::ApiError;
@@ -11,7 +11,6 @@ use axum::http::{HeaderMap, header};
 use bytes::Bytes;
 use futures_util::stream;
 use memchr::memmem;
-use serde_json::{Map, Value};
 use std::convert::Infallible;
 use std::task::Poll;
 use tokio::runtime::Handle;
@@ -140,7 +139,7 @@ fn add_part(
     let is_repeated;
     if name == "json" {
         is_repeated = parts.parameters.is_some();
-        parts.parameters = Some(parse_parameters(&content)?);
+        parts.parameters = Some(parse_parameters(content)?);
     } else if let Some(&known) = names.iter().find(|known| **known == name) {
         is_repeated = parts.images.iter().any(|(other, _)| *other == known);
         parts.images.push((known, content));
@@ -159,11 +158,11 @@ fn add_part(
 
 /// The part named `json`. Once parsed, JSON takes many times its length, so it may not be as long
 /// as an image.
-fn parse_parameters(content: &[u8]) -> Result<Map<String, Value>, ApiError> {
+fn parse_parameters(content: Vec<u8>) -> Result<JsonObject, ApiError> {
     if content.len() > MAX_PARAMETER_BYTES {
         return Err(parameters_too_long());
     }
-    serde_json::from_slice(content).map_err(json_error)
+    JsonObject::new(content)
 }
 
 fn broken(error: MultipartError) -> ApiError {

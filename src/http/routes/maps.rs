@@ -1,19 +1,19 @@
 //! `/maps`: sets of references that are searched together.
 
+use crate::http::access::Access;
 use crate::http::answer;
 use crate::http::body::{read_file, read_json};
 use crate::http::codec::Workload;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
-use axum::Json;
 use axum::extract::{Path, Request, State};
 use axum::http::StatusCode;
+use axum::Extension;
 use axum::response::Response;
 use placeformer_core::error::ErrorCode;
-use placeformer_core::types::{Calibration, MapName};
+use placeformer_core::types::{Calibration, MapName, Timestamp};
 use placeformer_store::MapInfo;
 use serde::Serialize;
-use time::OffsetDateTime;
 use utoipa::ToSchema;
 
 /// Largest file of a head in bytes: a VLAD of 80 words of ViT-S tokens, or of 20 of ViT-L tokens.
@@ -30,8 +30,8 @@ pub struct MapBody {
     /// References in it.
     pub references: u64,
     /// When it was created.
-    #[serde(with = "time::serde::rfc3339")]
-    pub created_at: OffsetDateTime,
+    #[schema(value_type = String, format = DateTime)]
+    pub created_at: Timestamp,
     /// How far its best answers can be trusted; null: as far as the model's own calibration says,
     /// see `/info`.
     pub calibration: Option<Calibration>,
@@ -65,7 +65,7 @@ pub struct MapDeleted {
 
 /// List maps
 ///
-/// All of them, by name.
+/// All of them, by name; with a key that is limited to maps, those.
 #[utoipa::path(
     get,
     path = "/maps",
@@ -75,21 +75,28 @@ pub struct MapDeleted {
         (status = 200, description = "All maps.", body = MapList),
     ),
 )]
-pub async fn list(State(state): State<AppState>) -> Result<Response, ApiError> {
-    let maps = state.service()?.maps().await?;
+pub async fn list(
+    State(state): State<AppState>,
+    Extension(access): Extension<Access>,
+) -> Result<Response, ApiError> {
+    let mut maps = state.service()?.maps(&access.caller).await?;
+    maps.retain(|map| access.maps.allows(&map.name));
     let list = || MapList {
         maps: maps.into_iter().map(Into::into).collect(),
     };
     answer::json(&state, Workload::Large, list).await
 }
 
-fn parse_name(text: &str) -> Result<MapName, ApiError> {
-    text.parse().map_err(|error| {
+/// The name in the path, of a map that the caller may use.
+fn parse_name(access: &Access, text: &str) -> Result<MapName, ApiError> {
+    let name = text.parse().map_err(|error| {
         ApiError::new(
             ErrorCode::MapNotFound,
             format!("no map can have this name: {error}"),
         )
-    })
+    })?;
+    access.check_map(&name)?;
+    Ok(name)
 }
 
 /// One map
@@ -107,9 +114,11 @@ fn parse_name(text: &str) -> Result<MapName, ApiError> {
 )]
 pub async fn get(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(map): Path<String>,
 ) -> Result<Json<MapBody>, ApiError> {
-    let info = state.service()?.map(parse_name(&map)?).await?;
+    let map = parse_name(&access, &map)?;
+    let info = state.service()?.map(&access.caller, map).await?;
     Ok(Json(info.into()))
 }
 
@@ -128,9 +137,11 @@ pub async fn get(
 )]
 pub async fn delete(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(map): Path<String>,
 ) -> Result<Json<MapDeleted>, ApiError> {
-    let references_deleted = state.service()?.delete_map(parse_name(&map)?).await?;
+    let map = parse_name(&access, &map)?;
+    let references_deleted = state.service()?.delete_map(&access.caller, map).await?;
     Ok(Json(MapDeleted { references_deleted }))
 }
 
@@ -152,13 +163,15 @@ pub async fn delete(
 )]
 pub async fn set_calibration(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(map): Path<String>,
     request: Request,
 ) -> Result<Json<Calibration>, ApiError> {
     let service = state.service()?;
+    let map = parse_name(&access, &map)?;
     let calibration: Calibration = read_json(&state, request).await?;
     service
-        .set_calibration(parse_name(&map)?, Some(calibration.clone()))
+        .set_calibration(&access.caller, map, Some(calibration.clone()))
         .await?;
     Ok(Json(calibration))
 }
@@ -178,11 +191,13 @@ pub async fn set_calibration(
 )]
 pub async fn remove_calibration(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(map): Path<String>,
 ) -> Result<StatusCode, ApiError> {
+    let map = parse_name(&access, &map)?;
     state
         .service()?
-        .set_calibration(parse_name(&map)?, None)
+        .set_calibration(&access.caller, map, None)
         .await?;
     Ok(StatusCode::NO_CONTENT)
 }
@@ -211,13 +226,14 @@ pub async fn remove_calibration(
 )]
 pub async fn set_head(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(map): Path<String>,
     request: Request,
 ) -> Result<Json<MapBody>, ApiError> {
     let service = state.service()?;
-    let map = parse_name(&map)?;
+    let map = parse_name(&access, &map)?;
     let file = read_file(&state, request, MAX_HEAD_BYTES).await?;
-    let info = service.set_head(map, Some(file)).await?;
+    let info = service.set_head(&access.caller, map, Some(file)).await?;
     Ok(Json(info.into()))
 }
 
@@ -237,9 +253,11 @@ pub async fn set_head(
 )]
 pub async fn remove_head(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(map): Path<String>,
 ) -> Result<Json<MapBody>, ApiError> {
     let service = state.service()?;
-    let info = service.set_head(parse_name(&map)?, None).await?;
+    let map = parse_name(&access, &map)?;
+    let info = service.set_head(&access.caller, map, None).await?;
     Ok(Json(info.into()))
 }

@@ -1,12 +1,15 @@
 //! `/match`: the evidence that two images show the same place.
 
 use super::shapes::{SizeBody, timed, timings_ms};
+use crate::http::access::Access;
 use crate::http::body::{ImageUpload, read_upload};
 use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use crate::pipeline::{MatchAnswer, MatchTarget, MatchedPair};
+use axum::Extension;
 use axum::extract::{Request, State};
+use axum::http::StatusCode;
 use axum::response::Response;
 use placeformer_core::types::ReferenceId;
 use placeformer_vision::rerank::CombinationMatch;
@@ -112,6 +115,7 @@ pub struct CorrespondenceBody {
 )]
 pub async fn match_images(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     request: Request,
 ) -> Result<Response, ApiError> {
     let service = state.service()?;
@@ -120,16 +124,24 @@ pub async fn match_images(
     let reference_id = std::mem::take(&mut upload.params).checked()?;
     let other = match (upload.take_optional("reference")?, reference_id) {
         (Some(image), None) => MatchTarget::Image(image),
-        (None, Some(id)) => MatchTarget::Reference(id),
+        (None, Some(id)) => {
+            access.check_reference(service, id).await?;
+            MatchTarget::Reference(id)
+        }
         _ => {
             return Err(ApiError::invalid(
                 "give either the image \"reference\" or reference_id",
             ));
         }
     };
-    let answer = service.match_images(query, other).await?;
+    let answer = service
+        .match_images(&access.caller, query, other)
+        .await?;
     let timings = answer.timings.clone();
-    timed(&state, &timings, move || answer_body(&answer)).await
+    timed(&state, StatusCode::OK, &timings, move || {
+        answer_body(&answer)
+    })
+    .await
 }
 
 fn answer_body(answer: &MatchAnswer) -> MatchAnswerBody {

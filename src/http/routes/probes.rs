@@ -1,5 +1,6 @@
 //! `/livez`, `/readyz`, `/metrics`: for supervisors, balancers and Prometheus.
 
+use crate::http::access::Access;
 use crate::http::answer::BudgetedWriter;
 use crate::http::body::read_query;
 use crate::http::codec::Workload;
@@ -12,6 +13,7 @@ use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
+use placeformer_core::types::MapName;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
@@ -140,7 +142,8 @@ fn answer(unready: Option<Unready>) -> Response {
 
 /// Metrics for Prometheus
 ///
-/// In the text exposition format.
+/// In the text exposition format. Where the server has keys, the names of maps are shown to those
+/// who present one, as far as it allows; for all others, and of all other maps, there is a sum.
 #[utoipa::path(
     get,
     path = "/metrics",
@@ -150,7 +153,10 @@ fn answer(unready: Option<Unready>) -> Response {
         (status = 200, description = "All series.", body = String, content_type = "text/plain"),
     ),
 )]
-pub async fn metrics(State(state): State<AppState>) -> Result<Response, ApiError> {
+pub async fn metrics(
+    State(state): State<AppState>,
+    Extension(access): Extension<Access>,
+) -> Result<Response, ApiError> {
     state
         .metrics
         .set_ready(state.health.unready_for_queries().is_none());
@@ -160,16 +166,17 @@ pub async fn metrics(State(state): State<AppState>) -> Result<Response, ApiError
     let shared = state.clone();
     let text = state
         .codec
-        .run(Workload::Small, move || render(&shared))
+        .run(Workload::Small, move || render(&shared, &access))
         .await?;
     Ok(([(header::CONTENT_TYPE, Metrics::content_type())], text).into_response())
 }
 
 /// The text of all series. It counts against a budget until the client has taken it, because
 /// everyone may ask for it.
-fn render(state: &AppState) -> Result<Bytes, ApiError> {
+fn render(state: &AppState, access: &Access) -> Result<Bytes, ApiError> {
     let mut writer = BudgetedWriter::new(&state.metrics_budget);
-    match state.metrics.render_to(&mut writer) {
+    let is_shown = |map: &MapName| access.maps.allows(map);
+    match state.metrics.render_to(is_shown, &mut writer) {
         Ok(()) => Ok(writer.finish()),
         Err(error) => Err(writer.failure(&error)),
     }

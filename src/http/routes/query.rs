@@ -1,20 +1,23 @@
 //! `/query`: which place does this photo show?
 
 use super::shapes::{LocationBody, location, timed, timings_ms};
+use crate::http::access::Access;
 use crate::http::body::{ImageUpload, read_upload};
 use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use crate::pipeline::{QueryAnswer, QueryOptions, QueryRequest, QueryResult};
+use axum::Extension;
 use axum::extract::{Request, State};
+use axum::http::StatusCode;
 use axum::response::Response;
-use placeformer_core::types::{Deadline, GeoCircle, GeoPoint, MapName, ReferenceFilter};
+use placeformer_core::types::{
+    Deadline, GeoCircle, GeoPoint, MapName, Metadata, ReferenceFilter, Timestamp,
+};
 use placeformer_vision::rerank::PairScore;
 use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
-use time::OffsetDateTime;
 use utoipa::{IntoParams, PartialSchema, ToSchema};
 
 /// What the body of a query consists of.
@@ -59,13 +62,13 @@ pub struct QueryParams {
     /// Only references captured at or after this time (RFC 3339).
     #[schema(value_type = Option<String>, format = DateTime)]
     #[param(value_type = Option<String>, format = DateTime)]
-    #[serde(default, with = "time::serde::rfc3339::option")]
-    pub captured_after: Option<OffsetDateTime>,
+    #[serde(default)]
+    pub captured_after: Option<Timestamp>,
     /// Only references captured before this time (RFC 3339).
     #[schema(value_type = Option<String>, format = DateTime)]
     #[param(value_type = Option<String>, format = DateTime)]
-    #[serde(default, with = "time::serde::rfc3339::option")]
-    pub captured_before: Option<OffsetDateTime>,
+    #[serde(default)]
+    pub captured_before: Option<Timestamp>,
     /// Milliseconds for the answer, counted from the arrival of the request's head. Too short for
     /// re-ranking, the answer is the global ranking and says `"reranked": false`.
     #[schema(minimum = 1)]
@@ -182,11 +185,11 @@ pub struct QueryResultBody {
     }))]
     pub scores: Option<BTreeMap<String, CombinationBody>>,
     /// When it was taken.
-    #[serde(with = "time::serde::rfc3339::option")]
-    pub captured_at: Option<OffsetDateTime>,
+    #[schema(value_type = Option<String>, format = DateTime)]
+    pub captured_at: Option<Timestamp>,
     /// Anything else the builder said.
     #[schema(value_type = Option<Object>)]
-    pub metadata: Option<Map<String, Value>>,
+    pub metadata: Option<Metadata>,
 }
 
 /// Outcome of one scale combination.
@@ -246,7 +249,11 @@ fn scores(score: &PairScore) -> BTreeMap<String, CombinationBody> {
         ),
     ),
 )]
-pub async fn query(State(state): State<AppState>, request: Request) -> Result<Response, ApiError> {
+pub async fn query(
+    State(state): State<AppState>,
+    Extension(access): Extension<Access>,
+    request: Request,
+) -> Result<Response, ApiError> {
     let arrived = Instant::now();
     let service = state.service()?;
     let mut upload = read_upload::<QueryParams>(&state, request, &UPLOAD).await?;
@@ -256,6 +263,7 @@ pub async fn query(State(state): State<AppState>, request: Request) -> Result<Re
         mut options,
         budget,
     } = std::mem::take(&mut upload.params).checked()?;
+    access.check_map(&map)?;
     let longest = Duration::from_millis(service.config().deadline_ms);
     let budget = budget.unwrap_or(longest).min(longest);
     // The time that the body took to arrive is part of the budget.
@@ -266,9 +274,9 @@ pub async fn query(State(state): State<AppState>, request: Request) -> Result<Re
         image,
         options,
     };
-    let answer = service.query(query).await?;
+    let answer = service.query(&access.caller, query).await?;
     let timings = answer.timings.clone();
-    timed(&state, &timings, || answer_body(answer)).await
+    timed(&state, StatusCode::OK, &timings, || answer_body(answer)).await
 }
 
 fn answer_body(answer: QueryAnswer) -> QueryAnswerBody {

@@ -1,6 +1,7 @@
 //! `/references`: the photos that make up the maps.
 
-use super::shapes::{ReferenceBody, json_object, point, present, timed};
+use super::shapes::{ReferenceBody, metadata, point, present, timed};
+use crate::http::access::Access;
 use crate::http::answer;
 use crate::http::body::{ImageUpload, read_json, read_query, read_upload};
 use crate::http::codec::Workload;
@@ -8,15 +9,17 @@ use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use crate::pipeline::{IngestAnswer, IngestRequest};
+use axum::Extension;
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderValue, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use placeformer_core::error::ErrorCode;
-use placeformer_core::types::{ExternalId, Heading, MapName, ReferenceFields, ReferenceId};
-use placeformer_store::ReferencePatch;
+use placeformer_core::types::{
+    ExternalId, Heading, MapName, Metadata, ReferenceFields, ReferenceId, Timestamp,
+};
+use placeformer_store::{Cursor, ReferencePatch};
 use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value};
-use time::OffsetDateTime;
 use utoipa::{IntoParams, PartialSchema, ToSchema};
 
 /// What the body of a new reference consists of.
@@ -74,13 +77,14 @@ pub struct ReferenceParams {
         format = DateTime,
         example = "2026-05-17T09:30:00Z",
     )]
-    #[serde(default, with = "time::serde::rfc3339::option")]
-    pub captured_at: Option<OffsetDateTime>,
-    /// Anything else, as a JSON object; returned as it came.
+    #[serde(default)]
+    pub captured_at: Option<Timestamp>,
+    /// Anything else, as a JSON object; numbers and the order of keys come back as they came. No key
+    /// may occur twice in an object.
     #[schema(value_type = Option<Object>)]
     #[param(value_type = Option<String>, example = "{\"camera\":\"left\"}")]
-    #[serde(default, deserialize_with = "json_object")]
-    pub metadata: Option<Map<String, Value>>,
+    #[serde(default, deserialize_with = "metadata")]
+    pub metadata: Option<Metadata>,
 }
 
 impl ReferenceParams {
@@ -135,24 +139,33 @@ impl ReferenceParams {
         ),
     ),
 )]
-pub async fn create(State(state): State<AppState>, request: Request) -> Result<Response, ApiError> {
+pub async fn create(
+    State(state): State<AppState>,
+    Extension(access): Extension<Access>,
+    request: Request,
+) -> Result<Response, ApiError> {
     let service = state.service()?;
     // A client whose photo cannot be stored now learns so before it sends the photo.
     service.may_store()?;
     let mut upload = read_upload::<ReferenceParams>(&state, request, &UPLOAD).await?;
     let image = upload.take("image")?;
     let (map, fields) = std::mem::take(&mut upload.params).checked()?;
-    let answer = service.ingest(IngestRequest { map, fields, image }).await?;
+    access.check_map(&map)?;
+    let new = IngestRequest { map, fields, image };
+    let answer = service.ingest(&access.caller, new).await?;
     let location = HeaderValue::from_str(&format!("/references/{}", answer.reference.id));
     let IngestAnswer {
         reference,
         created,
         timings,
     } = answer;
-    let mut response = timed(&state, &timings, || ReferenceBody::from(reference)).await?;
-    if created {
-        *response.status_mut() = StatusCode::CREATED;
-    }
+    let status = if created {
+        StatusCode::CREATED
+    } else {
+        StatusCode::OK
+    };
+    let body = || ReferenceBody::from(reference);
+    let mut response = timed(&state, status, &timings, body).await?;
     if let Ok(location) = location {
         response.headers_mut().insert(header::LOCATION, location);
     }
@@ -173,7 +186,7 @@ pub struct ListParams {
     #[serde(default)]
     external_id: Option<ExternalId>,
     /// The `next` of the page before.
-    #[param(value_type = Option<String>, format = Uuid)]
+    #[param(value_type = Option<String>, pattern = "^at-[0-9]{1,19}$")]
     cursor: Option<String>,
     /// References in a page.
     #[param(minimum = 1, maximum = 1000)]
@@ -190,7 +203,7 @@ pub enum Listing {
         /// Only this map.
         map: Option<MapName>,
         /// Starting behind this one.
-        after: Option<ReferenceId>,
+        after: Option<Cursor>,
         /// References in the page.
         limit: usize,
     },
@@ -220,7 +233,8 @@ impl ListParams {
 /// A page of references.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct ReferencePage {
-    /// In the order they were added.
+    /// In the order they were added. With a key that is limited to maps there may be fewer than
+    /// `limit`, also none, although there is a next page.
     references: Vec<ReferenceBody>,
     /// Pass as `cursor` for the next page; null on the last.
     next: Option<String>,
@@ -228,7 +242,8 @@ pub struct ReferencePage {
 
 /// List references
 ///
-/// In the order they were added, page by page.
+/// In the order they were added, page by page. Whoever follows `next` to the end misses none that
+/// was added before.
 #[utoipa::path(
     get,
     path = "/references",
@@ -239,16 +254,25 @@ pub struct ReferencePage {
         (status = 200, description = "A page.", body = ReferencePage),
     ),
 )]
-pub async fn list(State(state): State<AppState>, uri: Uri) -> Result<Response, ApiError> {
+pub async fn list(
+    State(state): State<AppState>,
+    Extension(access): Extension<Access>,
+    uri: Uri,
+) -> Result<Response, ApiError> {
     let listing = read_query::<ListParams>(&uri)?.checked(state.http.max_page)?;
     let service = state.service()?;
     let (references, next) = match listing {
         Listing::Named(map, external_id) => {
-            let found = service.find_external(map, external_id).await?;
-            (Vec::from_iter(found), None)
+            access.check_map(&map)?;
+            let finding = service.find_external(&access.caller, map, external_id);
+            (Vec::from_iter(finding.await?), None)
         }
         Listing::Page { map, after, limit } => {
-            let page = service.references(map, after, limit).await?;
+            map.iter().try_for_each(|map| access.check_map(map))?;
+            let listing = service.references(&access.caller, map, after, limit);
+            let mut page = listing.await?;
+            let references = &mut page.references;
+            references.retain(|reference| access.maps.allows(&reference.map));
             (page.references, page.next)
         }
     };
@@ -283,9 +307,13 @@ fn parse_id(text: &str) -> Result<ReferenceId, ApiError> {
 )]
 pub async fn get(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(id): Path<String>,
 ) -> Result<Response, ApiError> {
-    let reference = state.service()?.reference(parse_id(&id)?).await?;
+    let service = state.service()?;
+    let id = parse_id(&id)?;
+    access.check_reference(service, id).await?;
+    let reference = service.reference(&access.caller, id).await?;
     answer::json(&state, Workload::Small, || ReferenceBody::from(reference)).await
 }
 
@@ -312,16 +340,12 @@ pub struct ReferenceChange {
     /// When the photo was taken (RFC 3339).
     #[schema(value_type = Option<String>, format = DateTime)]
     #[serde(default, deserialize_with = "present")]
-    captured_at: Option<Option<Rfc3339>>,
+    captured_at: Option<Option<Timestamp>>,
     /// Replaces the whole object.
     #[schema(value_type = Option<Object>)]
     #[serde(default, deserialize_with = "present")]
-    metadata: Option<Option<Map<String, Value>>>,
+    metadata: Option<Option<Metadata>>,
 }
-
-#[derive(Debug, Deserialize)]
-#[serde(transparent)]
-struct Rfc3339(#[serde(with = "time::serde::rfc3339")] OffsetDateTime);
 
 impl ReferenceChange {
     fn checked(self) -> Result<ReferencePatch, ApiError> {
@@ -343,7 +367,7 @@ impl ReferenceChange {
             external_id: self.external_id,
             location,
             heading,
-            captured_at: self.captured_at.map(|at| at.map(|Rfc3339(at)| at)),
+            captured_at: self.captured_at,
             metadata: self.metadata,
         })
     }
@@ -365,12 +389,16 @@ impl ReferenceChange {
 )]
 pub async fn update(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(id): Path<String>,
     request: Request,
 ) -> Result<Response, ApiError> {
+    let service = state.service()?;
     let id = parse_id(&id)?;
+    access.check_reference(service, id).await?;
     let change: ReferenceChange = read_json(&state, request).await?;
-    let reference = state.service()?.update(id, change.checked()?).await?;
+    let changing = service.update(&access.caller, id, change.checked()?);
+    let reference = changing.await?;
     answer::json(&state, Workload::Small, || ReferenceBody::from(reference)).await
 }
 
@@ -389,8 +417,12 @@ pub async fn update(
 )]
 pub async fn delete(
     State(state): State<AppState>,
+    Extension(access): Extension<Access>,
     Path(id): Path<String>,
 ) -> Result<Response, ApiError> {
-    state.service()?.delete(parse_id(&id)?).await?;
+    let service = state.service()?;
+    let id = parse_id(&id)?;
+    access.check_reference(service, id).await?;
+    service.delete(&access.caller, id).await?;
     Ok(StatusCode::NO_CONTENT.into_response())
 }

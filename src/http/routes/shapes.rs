@@ -5,14 +5,15 @@ use crate::http::codec::Workload;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use crate::pipeline::Timings;
-use axum::http::{HeaderName, HeaderValue};
+use axum::http::{HeaderName, HeaderValue, StatusCode};
 use axum::response::Response;
-use placeformer_core::types::{GeoPoint, Heading, Reference};
+use placeformer_core::types::{GeoPoint, Heading, Metadata, Reference, Timestamp};
+use serde::de::value::MapAccessDeserializer;
+use serde::de::{Error, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
-use serde_json::{Map, Value};
 use std::collections::BTreeMap;
+use std::fmt;
 use std::fmt::Write;
-use time::OffsetDateTime;
 use utoipa::ToSchema;
 
 /// Header with the time in each stage.
@@ -53,18 +54,18 @@ pub struct ReferenceBody {
     /// Where it was taken.
     pub location: Option<LocationBody>,
     /// When it was taken.
-    #[serde(with = "time::serde::rfc3339::option")]
-    pub captured_at: Option<OffsetDateTime>,
+    #[schema(value_type = Option<String>, format = DateTime)]
+    pub captured_at: Option<Timestamp>,
     /// Anything else the builder said.
     #[schema(value_type = Option<Object>)]
-    pub metadata: Option<Map<String, Value>>,
+    pub metadata: Option<Metadata>,
     /// SHA-256 of the image as it was sent, in hexadecimal.
     pub content_sha256: String,
     /// The model that made its descriptor.
     pub model: String,
     /// When it was committed.
-    #[serde(with = "time::serde::rfc3339")]
-    pub created_at: OffsetDateTime,
+    #[schema(value_type = String, format = DateTime)]
+    pub created_at: Timestamp,
 }
 
 impl From<Reference> for ReferenceBody {
@@ -124,9 +125,11 @@ pub fn timings_ms(timings: &Timings) -> BTreeMap<&'static str, f64> {
 /// JSON with the timings in a `Server-Timing` header.
 ///
 /// # Errors
-/// `overloaded` if too many bytes of answers wait to be taken.
+/// `overloaded` if too many bytes of answers wait to be taken; `internal` if the body cannot be
+/// written as JSON. Nothing is answered then with the status of success.
 pub async fn timed<T: Serialize>(
     state: &AppState,
+    status: StatusCode,
     timings: &Timings,
     make: impl FnOnce() -> T + Send + 'static,
 ) -> Result<Response, ApiError> {
@@ -137,29 +140,43 @@ pub async fn timed<T: Serialize>(
         let _ = write!(header, "{comma}{stage};dur={ms}");
     }
     let mut response = answer::json(state, Workload::Small, make).await?;
+    *response.status_mut() = status;
     if !header.is_empty()
         && let Ok(value) = HeaderValue::from_str(&header)
     {
-        response.headers_mut().insert(SERVER_TIMING, value);
+        headers.insert(SERVER_TIMING, value);
     }
     Ok(response)
 }
 
-/// Reads a JSON object, or a string with the text of one, which is how it comes in a query string.
+/// Reads metadata from a JSON object, or from a string with the text of one, which is how it comes
+/// in a query string.
 ///
 /// # Errors
 /// The value is something else.
-pub fn json_object<'de, D: Deserializer<'de>>(
-    deserializer: D,
-) -> Result<Option<Map<String, Value>>, D::Error> {
-    use serde::de::Error;
-    match Option::<Value>::deserialize(deserializer)? {
-        None | Some(Value::Null) => Ok(None),
-        Some(Value::Object(object)) => Ok(Some(object)),
-        Some(Value::String(text)) => serde_json::from_str(&text)
-            .map(Some)
-            .map_err(|error| D::Error::custom(format!("metadata: {error}"))),
-        Some(_) => Err(D::Error::custom("metadata: it must be a JSON object")),
+pub fn metadata<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Metadata>, D::Error> {
+    deserializer.deserialize_any(MetadataVisitor)
+}
+
+struct MetadataVisitor;
+
+impl<'de> Visitor<'de> for MetadataVisitor {
+    type Value = Option<Metadata>;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a JSON object")
+    }
+
+    fn visit_unit<E: Error>(self) -> Result<Self::Value, E> {
+        Ok(None)
+    }
+
+    fn visit_str<E: Error>(self, text: &str) -> Result<Self::Value, E> {
+        Metadata::parse(text).map(Some).map_err(E::custom)
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, entries: A) -> Result<Self::Value, A::Error> {
+        Metadata::deserialize(MapAccessDeserializer::new(entries)).map(Some)
     }
 }
 

@@ -74,11 +74,13 @@ pub enum Rejection {
     AnswerMemory,
     /// All connections but those for probes are taken.
     Connections,
+    /// Its address presented too many keys that are not known.
+    FailedKeys,
 }
 
 impl Rejection {
     /// All reasons.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::QueueFull,
         Self::StoreBusy,
         Self::BodyMemory,
@@ -92,6 +94,7 @@ impl Rejection {
         Self::StorageLost,
         Self::AnswerMemory,
         Self::Connections,
+        Self::FailedKeys,
     ];
 
     /// Its label.
@@ -110,6 +113,7 @@ impl Rejection {
             Self::ClientGone => "client_gone",
             Self::AnswerMemory => "answer_memory",
             Self::Connections => "connections",
+            Self::FailedKeys => "failed_keys",
         }
     }
 }

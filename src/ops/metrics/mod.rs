@@ -9,13 +9,16 @@ mod labels;
 pub use labels::{ConnectionCut, ConnectionKind, MemoryComponent, PipelineStage, Rejection};
 
 use super::logging;
+use placeformer_core::types::MapName;
 use prometheus::core::Collector;
+use prometheus::proto::MetricFamily;
 use prometheus::process_collector::ProcessCollector;
 use prometheus::{
     Encoder, Error, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge,
     IntGaugeVec, Opts, Registry, TextEncoder,
 };
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 /// Upper bounds in seconds, 1 ms to 10 s.
@@ -56,7 +59,9 @@ pub struct Metrics {
     stage_seconds: HistogramVec,
     queue_depth: IntGauge,
     rejected: IntCounterVec,
-    references: IntGaugeVec,
+    /// References of each map. Their series are made when they are read, because not everyone may
+    /// see every name.
+    references: Mutex<Vec<(MapName, u64)>>,
     descriptor_bytes: HistogramVec,
     memory_bytes: IntGaugeVec,
     queries: QuerySeries,
@@ -91,7 +96,7 @@ impl Metrics {
             )?,
             queue_depth: series.gauge("queue_depth", "Requests waiting for or in compute.")?,
             rejected: series.counters("rejected_total", "Work turned away.", &["reason"])?,
-            references: series.gauges("references", "References that can be found.", &["map"])?,
+            references: Mutex::default(),
             descriptor_bytes: series.histograms(
                 "descriptor_bytes",
                 "Size of a stored descriptor.",
@@ -142,7 +147,6 @@ impl Metrics {
         for result in ["hit", "miss"] {
             self.cache_lookups.with_label_values(&[result]);
         }
-        self.references.with_label_values(&[OTHER_MAPS]);
         for kind in ConnectionKind::ALL {
             self.set_connections(kind, 0);
         }
@@ -252,19 +256,9 @@ impl Metrics {
             .set(bytes as i64);
     }
 
-    /// References per map; the largest [`MAPS_SHOWN`] keep their name.
-    pub fn set_references(&self, mut maps: Vec<(String, u64)>) {
-        maps.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
-        let rest = maps.split_off(maps.len().min(MAPS_SHOWN));
-        self.references.reset();
-        for (map, count) in &maps {
-            self.references.with_label_values(&[map]).set(*count as i64);
-        }
-        let other: u64 = rest.iter().map(|(_, count)| count).sum();
-        // Added, because a map may have that name, too.
-        self.references
-            .with_label_values(&[OTHER_MAPS])
-            .add(other as i64);
+    /// References of each map.
+    pub fn set_references(&self, maps: Vec<(MapName, u64)>) {
+        *self.lock_references() = maps;
     }
 
     /// Connections that are open.
@@ -280,21 +274,58 @@ impl Metrics {
         series.inc();
     }
 
-    /// All series in Prometheus' text format.
+    /// All series in Prometheus' text format. Of the maps that `is_shown` lets through, the largest
+    /// [`MAPS_SHOWN`] have their name; all others are added up.
     ///
     /// # Errors
     /// A series cannot be written as text.
-    pub fn render(&self) -> Result<String, Error> {
+    pub fn render(&self, is_shown: impl Fn(&MapName) -> bool) -> Result<String, Error> {
+        TextEncoder::new().encode_to_string(&self.families(is_shown)?)
+    }
+
+    fn families(&self, is_shown: impl Fn(&MapName) -> bool) -> Result<Vec<MetricFamily>, Error> {
         self.lost_log_lines.follow(logging::lost_lines());
-        TextEncoder::new().encode_to_string(&self.registry.gather())
+        let mut families = self.registry.gather();
+        families.extend(self.reference_series(is_shown)?.collect());
+        Ok(families)
+    }
+
+    fn reference_series(&self, is_shown: impl Fn(&MapName) -> bool) -> Result<IntGaugeVec, Error> {
+        let gauges = IntGaugeVec::new(
+            options("references", "References that can be found."),
+            &["map"],
+        )?;
+        let maps = self.lock_references();
+        let (mut shown, hidden): (Vec<_>, Vec<_>) = maps.iter().partition(|(map, _)| is_shown(map));
+        shown.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
+        let rest = shown.split_off(shown.len().min(MAPS_SHOWN));
+        for (map, count) in shown {
+            gauges.with_label_values(&[map.as_str()]).set(*count as i64);
+        }
+        let other: u64 = rest.iter().chain(&hidden).map(|(_, count)| count).sum();
+        // Added, because a map may have that name, too.
+        gauges.with_label_values(&[OTHER_MAPS]).add(other as i64);
+        Ok(gauges)
+    }
+
+    // A thread that panics with the lock leaves the list whole, because it is replaced by one
+    // assignment. So a poisoned lock can be used all the same.
+    fn lock_references(&self) -> MutexGuard<'_, Vec<(MapName, u64)>> {
+        self.references
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Writes what [`Metrics::render`] returns.
     ///
     /// # Errors
     /// A series cannot be written as text, or `writer` takes no more.
-    pub fn render_to(&self, writer: &mut impl std::io::Write) -> Result<(), Error> {
-        TextEncoder::new().encode(&self.registry.gather(), writer)
+    pub fn render_to(
+        &self,
+        is_shown: impl Fn(&MapName) -> bool,
+        writer: &mut impl std::io::Write,
+    ) -> Result<(), Error> {
+        TextEncoder::new().encode(&self.families(is_shown)?, writer)
     }
 
     /// Content type of [`Metrics::render`].
@@ -455,7 +486,7 @@ mod tests {
 
     #[test]
     fn every_series_of_the_design_is_there_from_the_start() {
-        let text = Metrics::new().unwrap().render().unwrap();
+        let text = Metrics::new().unwrap().render(|_| true).unwrap();
         for series in [
             "placeformer_stage_duration_seconds_count{stage=\"commit\"} 0",
             "placeformer_rejected_total{reason=\"queue_full\"} 0",
@@ -473,11 +504,39 @@ mod tests {
         }
     }
 
+    fn sixty_maps() -> Vec<(MapName, u64)> {
+        let map = |i: u64| (format!("map{i:02}").parse().unwrap(), 100 - i);
+        (0..60).map(map).collect()
+    }
+
+    #[test]
+    fn maps_that_are_not_shown_are_added_up() {
+        let metrics = Metrics::new().unwrap();
+        let series = |is_shown: fn(&MapName) -> bool| {
+            let text = metrics.render(is_shown).unwrap();
+            let lines = text
+                .lines()
+                .filter(|line| line.starts_with("placeformer_references{"));
+            lines.map(str::to_owned).collect::<Vec<_>>()
+        };
+        assert_eq!(
+            series(|_| true),
+            ["placeformer_references{map=\"other\"} 0"]
+        );
+        metrics.set_references(sixty_maps());
+        let all: u64 = (0..60).map(|i| 100 - i).sum();
+        let other = format!("placeformer_references{{map=\"other\"}} {all}");
+        assert_eq!(series(|_| false), [other]);
+        let other = format!("placeformer_references{{map=\"other\"}} {}", all - 88);
+        let own = "placeformer_references{map=\"map12\"} 88".to_owned();
+        assert_eq!(series(|map| map.as_str() == "map12"), [own, other]);
+    }
+
     #[test]
     fn maps_beyond_fifty_fold_into_other() {
         let metrics = Metrics::new().unwrap();
-        metrics.set_references((0..60).map(|i| (format!("map{i:02}"), 100 - i)).collect());
-        let text = metrics.render().unwrap();
+        metrics.set_references(sixty_maps());
+        let text = metrics.render(|_| true).unwrap();
         assert_eq!(
             text.lines()
                 .filter(|line| line.starts_with("placeformer_references{"))

@@ -10,7 +10,8 @@
 use super::position::{GeoPoint, Heading};
 use super::utm_zone::{MetricPoint, UtmZone};
 use crate::invalid::InvalidValue;
-use time::{Date, Month, OffsetDateTime, PrimitiveDateTime, Time};
+use crate::types::Timestamp;
+use time::{Date, Month, PrimitiveDateTime, Time};
 
 /// What a name says.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,7 +27,7 @@ pub struct UtmName {
     /// Where the camera looked.
     pub heading: Option<Heading>,
     /// When it was taken; such names give no zone of time, so UTC is assumed.
-    pub captured_at: Option<OffsetDateTime>,
+    pub captured_at: Option<Timestamp>,
 }
 
 impl UtmName {
@@ -102,7 +103,7 @@ fn is_extension(text: &str) -> bool {
 }
 
 /// `YYYYMMDD_hhmmss`, everything from the right optional; what is missing counts as the beginning.
-fn parse_time(text: &str) -> Option<OffsetDateTime> {
+fn parse_time(text: &str) -> Option<Timestamp> {
     let (day_part, time_part) = text.split_once('_').unwrap_or((text, ""));
     let digits = |text: &str, range: std::ops::Range<usize>, default: u8| match text.get(range) {
         Some(part) => part.parse().ok(),
@@ -116,7 +117,7 @@ fn parse_time(text: &str) -> Option<OffsetDateTime> {
         digits(time_part, 2..4, 0)?,
         digits(time_part, 4..6, 0)?,
     );
-    Some(PrimitiveDateTime::new(date, time.ok()?).assume_utc())
+    Timestamp::of(PrimitiveDateTime::new(date, time.ok()?).assume_utc())
 }
 
 #[cfg(test)]
@@ -147,7 +148,10 @@ mod tests {
             (parsed.pano_id.as_str(), parsed.heading.unwrap().degrees()),
             ("pano-1", 90.0)
         );
-        assert_eq!(parsed.captured_at, Some(datetime!(2013-11-01 0:00 UTC)));
+        assert_eq!(
+            parsed.captured_at,
+            Timestamp::of(datetime!(2013-11-01 0:00 UTC))
+        );
         let geo = parsed.location(None).unwrap();
         assert!(
             geo.distance_m(GeoPoint::new(40.42412, -80.00610).unwrap()) < 2_000.0,
@@ -187,9 +191,10 @@ mod tests {
     fn times_may_stop_anywhere() {
         assert_eq!(
             parse_time("20190102_030405"),
-            Some(datetime!(2019-01-02 3:04:05 UTC))
+            Timestamp::of(datetime!(2019-01-02 3:04:05 UTC))
         );
-        assert_eq!(parse_time("2019"), Some(datetime!(2019-01-01 0:00 UTC)));
+        let new_year = Timestamp::of(datetime!(2019-01-01 0:00 UTC));
+        assert_eq!(parse_time("2019"), new_year);
         assert_eq!(parse_time("201913"), None);
         assert_eq!(parse_time(""), None);
     }

@@ -13,6 +13,9 @@ use utoipa::ToSchema;
 
 /// The version of the JSON that this release reads and writes.
 const FORMAT: u32 = 1;
+/// Largest magnitude of a weight. S is below a million and a distance at most 2, so that no sum of
+/// such weights overflows.
+const LARGEST_WEIGHT: f64 = 1e6;
 /// Longest name of the data a calibration was fitted on, in characters.
 const LONGEST_DATA: usize = 200;
 
@@ -47,8 +50,9 @@ impl ConfidenceWeights {
             ("distance", self.distance),
         ];
         for (field, value) in named {
-            if !value.is_finite() {
-                let reason = format!("{value} is not a finite number");
+            // NaN is in no range.
+            if !(-LARGEST_WEIGHT..=LARGEST_WEIGHT).contains(&value) {
+                let reason = format!("{value} is outside -{LARGEST_WEIGHT} to {LARGEST_WEIGHT}");
                 return Err(InvalidValue::new(field, reason));
             }
         }
@@ -99,6 +103,13 @@ impl ConfidenceCurve {
 
     fn check(&self) -> Result<(), InvalidValue> {
         self.weights.check()?;
+        if self.without_match > self.wrong {
+            let reason = format!(
+                "{} are more than the {} wrong",
+                self.without_match, self.wrong
+            );
+            return Err(InvalidValue::new("without_match", reason));
+        }
         check_share("threshold", self.threshold)?;
         check_share("precision", self.precision)?;
         check_share("recall", self.recall)?;
@@ -298,6 +309,10 @@ mod tests {
             ("/global/weights/score", json!(0.5), "global"),
             ("/global/right", json!(-1), "-1"),
             ("/global/recall", Value::Null, "null"),
+            ("/reranked/weights/bias", json!(1e308), "bias"),
+            ("/reranked/weights/score", json!(1e308), "score"),
+            ("/reranked/weights/distance", json!(-1e308), "distance"),
+            ("/global/without_match", json!(41), "without_match"),
         ] {
             let mut changed = whole();
             *changed.pointer_mut(pointer).unwrap() = value;
@@ -342,9 +357,9 @@ mod tests {
     proptest! {
         #[test]
         fn confidence_is_a_probability_that_follows_the_evidence(
-            bias in -50.0..50.0f64,
-            score in 0.0..10.0f64,
-            distance in -20.0..0.0f64,
+            bias in prop_oneof![-50.0..50.0f64, -LARGEST_WEIGHT..=LARGEST_WEIGHT],
+            score in prop_oneof![0.0..10.0f64, 0.0..=LARGEST_WEIGHT],
+            distance in prop_oneof![-20.0..0.0f64, -LARGEST_WEIGHT..=0.0],
             (fewer, more) in ordered(2000.0),
             (near, far) in ordered(2.0),
         ) {

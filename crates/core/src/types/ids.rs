@@ -108,16 +108,16 @@ impl fmt::Display for MapName {
     }
 }
 
-/// The caller's own name for a reference, unique within a map. 1 to 256 bytes, no control
+/// The caller's own name for a reference, unique within a map. 1 to 256 characters, no control
 /// characters.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct ExternalId(String);
 
 impl ExternalId {
-    /// Longest name in bytes.
+    /// Longest name in characters, which is how the OpenAPI document counts.
     const LONGEST: usize = 256;
-    const RULE: &'static str = "use 1 to 256 bytes without control characters";
+    const RULE: &'static str = "use 1 to 256 characters, none of them a control character";
 
     /// The name as text.
     pub fn as_str(&self) -> &str {
@@ -129,7 +129,9 @@ impl FromStr for ExternalId {
     type Err = InvalidName;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let has_valid_length = (1..=Self::LONGEST).contains(&text.len());
+        // Counting stops behind the longest, so that a long text costs no more than a short one.
+        let characters = text.chars().take(Self::LONGEST + 1).count();
+        let has_valid_length = (1..=Self::LONGEST).contains(&characters);
         if has_valid_length && !text.chars().any(char::is_control) {
             Ok(Self(text.to_owned()))
         } else {
@@ -242,10 +244,16 @@ mod tests {
 
     #[test]
     fn external_ids_reject_control_characters_and_excess_length() {
-        for good in ["a", "photos/1 é.jpg", &"x".repeat(256)] {
+        for good in [
+            "a",
+            "photos/1 é.jpg",
+            &"x".repeat(256),
+            &"é".repeat(256),
+            &"🏠".repeat(256),
+        ] {
             assert!(good.parse::<ExternalId>().is_ok(), "{good}");
         }
-        for bad in ["", "a\nb", "\u{7f}", &"x".repeat(257)] {
+        for bad in ["", "a\nb", "\u{7f}", &"x".repeat(257), &"🏠".repeat(257)] {
             assert!(bad.parse::<ExternalId>().is_err(), "{bad:?}");
         }
     }

@@ -7,7 +7,9 @@ mod calibration;
 mod deadline;
 mod descriptor;
 mod ids;
+mod metadata;
 mod reference;
+mod timestamp;
 
 pub use crate::geography::{GeoCircle, GeoPoint, Heading};
 pub use crate::invalid::{InvalidName, InvalidValue};
@@ -18,4 +20,6 @@ pub use descriptor::{
     PoolingStride, SCALES, ScaleKeyPatches, ScaleSet,
 };
 pub use ids::{ContentHash, ExternalId, MapName, ModelId, ReferenceId, RerankId};
+pub use metadata::Metadata;
 pub use reference::{NewReference, Reference, ReferenceFields, ReferenceFilter};
+pub use timestamp::Timestamp;

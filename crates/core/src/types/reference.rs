@@ -2,8 +2,9 @@
 
 use super::descriptor::Descriptor;
 use super::ids::{ContentHash, ExternalId, MapName, ModelId, ReferenceId};
+use super::metadata::Metadata;
+use super::timestamp::Timestamp;
 use crate::geography::{GeoCircle, GeoPoint, Heading};
-use time::OffsetDateTime;
 
 /// What the map builder says about a photo.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -15,9 +16,9 @@ pub struct ReferenceFields {
     /// Where the camera looked.
     pub heading: Option<Heading>,
     /// When it was taken.
-    pub captured_at: Option<OffsetDateTime>,
-    /// Anything else; a JSON object, returned as it came.
-    pub metadata: Option<serde_json::Map<String, serde_json::Value>>,
+    pub captured_at: Option<Timestamp>,
+    /// Anything else.
+    pub metadata: Option<Metadata>,
 }
 
 /// A reference about to be stored.
@@ -49,7 +50,7 @@ pub struct Reference {
     /// The model that made its descriptor.
     pub model: ModelId,
     /// When it was committed.
-    pub created_at: OffsetDateTime,
+    pub created_at: Timestamp,
 }
 
 /// Which references of a map a search may return. Empty means all.
@@ -58,9 +59,9 @@ pub struct ReferenceFilter {
     /// Only references located inside; those without a location never are.
     pub near: Option<GeoCircle>,
     /// Only references captured at or after this instant; those without a time never are.
-    pub captured_after: Option<OffsetDateTime>,
+    pub captured_after: Option<Timestamp>,
     /// Only references captured before this instant; those without a time never are.
-    pub captured_before: Option<OffsetDateTime>,
+    pub captured_before: Option<Timestamp>,
 }
 
 impl ReferenceFilter {
@@ -70,7 +71,7 @@ impl ReferenceFilter {
     }
 
     /// Whether a reference with this location and capture time passes.
-    pub fn accepts(&self, location: Option<GeoPoint>, captured_at: Option<OffsetDateTime>) -> bool {
+    pub fn accepts(&self, location: Option<GeoPoint>, captured_at: Option<Timestamp>) -> bool {
         let is_near = match self.near {
             Some(circle) => location.is_some_and(|point| circle.contains(point)),
             None => true,
@@ -90,10 +91,15 @@ impl ReferenceFilter {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use time::Duration;
     use time::macros::datetime;
 
     const HERE: (f64, f64) = (51.0, 7.0);
-    const NOON: OffsetDateTime = datetime!(2024-05-01 12:00 UTC);
+
+    /// Noon and so many hours.
+    fn noon_and(hours: Duration) -> Timestamp {
+        Timestamp::of(datetime!(2024-05-01 12:00 UTC) + hours).unwrap()
+    }
 
     fn point((lat, lon): (f64, f64)) -> Option<GeoPoint> {
         Some(GeoPoint::new(lat, lon).unwrap())
@@ -116,7 +122,7 @@ mod tests {
         assert!(!near.accepts(point((51.01, 7.0)), None));
         assert!(!near.accepts(None, None));
         let recent = ReferenceFilter {
-            captured_after: Some(NOON),
+            captured_after: Some(noon_and(Duration::ZERO)),
             ..Default::default()
         };
         assert!(!recent.accepts(None, None));
@@ -125,12 +131,12 @@ mod tests {
     #[test]
     fn the_start_of_a_time_range_belongs_to_it_and_the_end_does_not() {
         let filter = ReferenceFilter {
-            captured_after: Some(NOON),
-            captured_before: Some(NOON + time::Duration::HOUR),
+            captured_after: Some(noon_and(Duration::ZERO)),
+            captured_before: Some(noon_and(Duration::HOUR)),
             ..Default::default()
         };
-        assert!(filter.accepts(None, Some(NOON)));
-        assert!(!filter.accepts(None, Some(NOON - time::Duration::SECOND)));
-        assert!(!filter.accepts(None, Some(NOON + time::Duration::HOUR)));
+        assert!(filter.accepts(None, Some(noon_and(Duration::ZERO))));
+        assert!(!filter.accepts(None, Some(noon_and(-Duration::SECOND))));
+        assert!(!filter.accepts(None, Some(noon_and(Duration::HOUR))));
     }
 }

@@ -7,7 +7,7 @@
 use super::scenes::index_entry;
 use placeformer_core::types::{ExternalId, MapName, PackedPatches, Reference, ReferenceId};
 use placeformer_store::{
-    CombinedStore, GlobalRow, MapInfo, Page, PlaceStore, ReadPlaces, StoreError,
+    CombinedStore, Cursor, GlobalRow, MapInfo, Page, PlaceStore, ReadPlaces, StoreError,
 };
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -87,10 +87,14 @@ impl ReadPlaces for FilledStore {
         self.store.find_external(map, external_id)
     }
 
+    fn map_of(&self, id: ReferenceId) -> Result<MapName, StoreError> {
+        self.store.map_of(self.real(id))
+    }
+
     fn list(
         &self,
         map: Option<&MapName>,
-        after: Option<ReferenceId>,
+        after: Option<Cursor>,
         limit: usize,
     ) -> Result<Page, StoreError> {
         self.store.list(map, after, limit)

@@ -9,7 +9,7 @@ use super::engine::failed;
 use super::mark::CommitMark;
 use super::sequence::progress;
 use crate::error::StoreError;
-use placeformer_core::files::{directory_of, sync_directory, with_suffix};
+use placeformer_core::files::{create_private_file, directory_of, sync_directory, with_suffix};
 use rusqlite::Connection;
 use rusqlite::backup::{Backup, StepResult};
 use std::fs::{self, File};
@@ -31,6 +31,9 @@ pub(super) fn write(
         });
     }
     let partial = with_suffix(target, ".partial");
+    // What an interrupted backup left is of no use, and may be open to others.
+    let _ = fs::remove_file(&partial);
+    create_private_file(&partial).map_err(io("cannot create the backup", target))?;
     if let Err(error) = copy(connection, &partial, least) {
         // The caller needs the first error, so a failure to remove the rest is not reported.
         let _ = fs::remove_file(&partial);

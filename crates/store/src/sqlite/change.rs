@@ -4,17 +4,16 @@ use super::engine::failed;
 use super::keys::{MapNumber, ReferenceNumber};
 use super::map_row::MapRow;
 use super::reference_row::{
-    ReferenceRow, id_of, locate, number_of_external, read_by_number, reference_by_number,
+    ReferenceRow, id_of, locate, map_of, number_of_external, read_by_number, reference_by_number,
 };
 use super::remove::remove;
 use super::row::RowError;
 use crate::error::StoreError;
 use crate::records::ReferencePatch;
 use placeformer_core::types::{
-    Calibration, ContentHash, MapName, ModelId, Reference, ReferenceFields, ReferenceId,
+    Calibration, ContentHash, MapName, ModelId, Reference, ReferenceFields, ReferenceId, Timestamp,
 };
 use rusqlite::Connection;
-use time::OffsetDateTime;
 
 /// Changes a reference's fields; its descriptor stays.
 pub(super) fn update(
@@ -71,13 +70,7 @@ pub(super) struct Deleted {
 pub(super) fn delete(connection: &Connection, id: ReferenceId) -> Result<Deleted, StoreError> {
     let failed = failed("deleting a reference");
     let located = locate(connection, id)?;
-    let name: String = connection
-        .prepare_cached("SELECT name FROM map WHERE number = ?1")
-        .and_then(|mut statement| statement.query_row([located.map], |row| row.get("name")))
-        .map_err(&failed)?;
-    let name: MapName = name
-        .parse()
-        .map_err(|_| StoreError::CorruptMap { map: name })?;
+    let name = map_of(connection, id)?;
     let map = MapRow::require(connection, &name)?;
     let reference = match reference_by_number(connection, located.number) {
         Ok(Some(reference)) => reference,
@@ -100,7 +93,7 @@ fn unreadable(id: ReferenceId, map: MapName, model: ModelId) -> Reference {
         fields: ReferenceFields::default(),
         content_hash: ContentHash([0; 32]),
         model,
-        created_at: OffsetDateTime::UNIX_EPOCH,
+        created_at: Timestamp::EARLIEST,
     }
 }
 
@@ -161,4 +154,4 @@ pub(super) fn set_calibration(
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

@@ -4,6 +4,7 @@
 //! process, however that ends, so no stale lock can remain.
 
 use crate::error::StoreError;
+use placeformer_core::files::{create_private_directory, create_private_file};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{ErrorKind, Read, Seek, Write};
 use std::path::{Path, PathBuf};
@@ -38,13 +39,12 @@ pub(super) struct DataDirectory {
 impl DataDirectory {
     /// Creates the directory if need be and locks it.
     pub(super) fn claim(path: &Path) -> Result<Self, StoreError> {
-        std::fs::create_dir_all(path).map_err(io("cannot create directory", path))?;
+        create_private_directory(path).map_err(io("cannot create directory", path))?;
         let lock_path = path.join(LOCK);
+        create_private_file(&lock_path).map_err(io("cannot create", &lock_path))?;
         let mut lock = OpenOptions::new()
             .read(true)
             .write(true)
-            .create(true)
-            .truncate(false)
             .open(&lock_path)
             .map_err(io("cannot open", &lock_path))?;
         match lock.try_lock() {

@@ -5,8 +5,10 @@
 //! Pages are large because most bytes are patch blobs of a hundred kilobytes: fewer overflow pages
 //! to chain through.
 
+use super::directory::io;
 use crate::config::StoreConfig;
 use crate::error::{EngineCause, StoreError};
+use placeformer_core::files::create_private_file;
 use rusqlite::{Connection, Error as SqliteError, ErrorCode as SqliteCode, OpenFlags};
 use std::path::Path;
 use std::time::Duration;
@@ -100,6 +102,8 @@ pub(super) fn open_writer(
     log_bytes: u64,
 ) -> Result<Connection, StoreError> {
     let opening = failed("opening it for writing");
+    // The engine gives its log and its shared memory the mode of the database.
+    create_private_file(path).map_err(io("cannot create", path))?;
     let flags = OpenFlags::SQLITE_OPEN_READ_WRITE
         | OpenFlags::SQLITE_OPEN_CREATE
         | OpenFlags::SQLITE_OPEN_NO_MUTEX;

@@ -11,17 +11,16 @@ use super::parts::{write_global, write_patches, write_pooled};
 use super::quarantine;
 use super::reference_row::{ReferenceRow, id_of, number_of_external, reference_by_number};
 use super::remove::{count, remove};
-use super::row::{RowError, as_stored, to_micros};
+use super::row::RowError;
 use super::sequence::{next_reference, next_version};
 use crate::error::StoreError;
 use crate::records::Inserted;
 use crate::{codec, crash_points};
 use placeformer_core::types::{
     ContentHash, ExternalId, GLOBAL_DIM, MapName, ModelId, NewReference, Reference,
-    ReferenceFields, ReferenceId,
+    ReferenceFields, ReferenceId, Timestamp,
 };
 use rusqlite::Connection;
-use time::OffsetDateTime;
 
 /// Bytes that a reference takes in addition to its descriptor, about.
 const ROW_BYTES: usize = 1024;
@@ -160,7 +159,7 @@ fn create_map(
         pending_version: None,
         reference_count: 0,
         calibration: None,
-        created_at: as_stored(OffsetDateTime::now_utc()),
+        created_at: Timestamp::now(),
     };
     map.insert(connection)?;
     Ok(map)
@@ -232,7 +231,7 @@ fn reference_row(new: &Prepared, map: &MapRow, number: ReferenceNumber) -> Refer
         captured_at: None,
         metadata: None,
         content_hash: new.content_hash.0,
-        created_at: to_micros(OffsetDateTime::now_utc()),
+        created_at: Timestamp::now().unix_micros(),
     };
     row.set_fields(&new.fields);
     row

@@ -3,6 +3,7 @@
 //! To the engine they are all 64-bit integers, so a map's number passed for a reference's would
 //! find some row and go unnoticed. Each kind is therefore a type of its own.
 
+use crate::records::Cursor;
 use rusqlite::ToSql;
 use rusqlite::types::{FromSql, FromSqlResult, ToSqlOutput, ValueRef};
 
@@ -50,4 +51,14 @@ impl MapNumber {
 impl ReferenceNumber {
     /// Less than every number, for scans that start at the beginning.
     pub(super) const BEFORE_ALL: Self = Self(i64::MIN);
+
+    /// The reference at a cursor.
+    pub(super) fn at(cursor: Cursor) -> Self {
+        Self(cursor.number())
+    }
+
+    /// The place of this reference.
+    pub(super) fn cursor(self) -> Cursor {
+        Cursor::at(self.0)
+    }
 }

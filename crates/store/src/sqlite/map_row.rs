@@ -3,11 +3,10 @@
 use super::checksum::RowChecksum;
 use super::engine::failed;
 use super::keys::{MapNumber, Version};
-use super::row::{RowError, from_micros, to_micros, verify};
+use super::row::{RowError, from_micros, verify};
 use crate::error::StoreError;
-use placeformer_core::types::{Calibration, MapName, ModelId};
+use placeformer_core::types::{Calibration, MapName, ModelId, Timestamp};
 use rusqlite::{CachedStatement, Connection, Row, named_params};
-use time::OffsetDateTime;
 
 /// A map's row.
 #[derive(Debug, Clone)]
@@ -22,7 +21,7 @@ pub(super) struct MapRow {
     pub reference_count: i64,
     /// JSON, as it was given.
     pub calibration: Option<String>,
-    pub created_at: OffsetDateTime,
+    pub created_at: Timestamp,
 }
 
 /// The maps that could be read, and the names of those that could not.
@@ -40,7 +39,7 @@ impl MapRow {
             .bytes(self.model.as_str().as_bytes())
             .integer(self.version.value())
             .optional(self.calibration.as_ref())
-            .integer(to_micros(self.created_at))
+            .integer(self.created_at.unix_micros())
             .finish()
     }
 
@@ -139,7 +138,7 @@ impl MapRow {
                 ":model": self.model.as_str(),
                 ":version": self.version,
                 ":references": self.reference_count,
-                ":created_at": to_micros(self.created_at),
+                ":created_at": self.created_at.unix_micros(),
                 ":checksum": self.checksum(),
             },
         )?;

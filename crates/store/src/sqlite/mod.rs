@@ -61,8 +61,8 @@ use crate::config::StoreConfig;
 use crate::crash_points;
 use crate::error::StoreError;
 use crate::records::{
-    Damage, Footprint, GlobalRow, Inserted, MapInfo, NewHead, Page, Quarantined, ReferencePatch,
-    VerifyReport,
+    Cursor, Damage, Footprint, GlobalRow, Inserted, MapInfo, NewHead, Page, Quarantined,
+    ReferencePatch, VerifyReport,
 };
 use crate::traits::{HeadExchange, MaintainPlaces, ReadPlaces, WritePlaces};
 use placeformer_core::files::{sync_directory, with_suffix};
@@ -212,10 +212,15 @@ impl ReadPlaces for SqliteStore {
         database.read(|connection| database.reference_by_external_id(connection, map, external_id))
     }
 
+    fn map_of(&self, id: ReferenceId) -> Result<MapName, StoreError> {
+        self.database
+            .read(|connection| reference_row::map_of(connection, id))
+    }
+
     fn list(
         &self,
         map: Option<&MapName>,
-        after: Option<ReferenceId>,
+        after: Option<Cursor>,
         limit: usize,
     ) -> Result<Page, StoreError> {
         let database = &self.database;

@@ -7,14 +7,12 @@
 
 use super::engine::failed;
 use super::keys::{MapNumber, ReferenceNumber};
-use super::row::to_micros;
 use crate::error::StoreError;
 use crate::records::{Damage, Quarantined};
-use placeformer_core::types::ReferenceId;
+use placeformer_core::types::{ReferenceId, Timestamp};
 use rusqlite::{Connection, named_params};
 use std::collections::{BTreeMap, HashSet};
 use std::sync::{Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
-use time::OffsetDateTime;
 
 /// Most finds remembered of damage that stands for no quarantined reference. Any number of
 /// identities may be asked for that a damaged page of the index hides.
@@ -182,7 +180,7 @@ pub(super) fn record(
                 ":id": damaged.id.as_bytes().as_slice(),
                 ":map": damaged.map,
                 ":reason": damaged.reason,
-                ":detected_at": to_micros(OffsetDateTime::now_utc()),
+                ":detected_at": Timestamp::now().unix_micros(),
             },
         )
         .map_err(failed("recording a damaged reference"))?;

@@ -3,14 +3,13 @@
 use super::checksum::RowChecksum;
 use super::engine::{damage, failed};
 use super::keys::{MapNumber, ReferenceNumber};
-use super::row::{RowError, from_micros, id_or_zeros, to_micros, verify};
+use super::row::{RowError, from_micros, id_or_zeros, verify};
 use crate::error::StoreError;
 use placeformer_core::types::{
-    ContentHash, ExternalId, GeoPoint, Heading, MapName, ModelId, Reference, ReferenceFields,
-    ReferenceId,
+    ContentHash, ExternalId, GeoPoint, Heading, MapName, Metadata, ModelId, Reference,
+    ReferenceFields, ReferenceId, Timestamp,
 };
 use rusqlite::{Connection, OptionalExtension, Row, Statement, named_params};
-use time::OffsetDateTime;
 
 /// What a statement selects from [`REFERENCE_SOURCE`] for [`ReferenceColumns`].
 pub(super) const REFERENCE_COLUMNS: &str = "r.number AS number, r.id AS id, r.map AS map, \
@@ -131,11 +130,8 @@ impl ReferenceRow {
         self.lat = fields.location.map(GeoPoint::lat);
         self.lon = fields.location.map(GeoPoint::lon);
         self.heading = fields.heading.map(Heading::degrees);
-        self.captured_at = fields.captured_at.map(to_micros);
-        self.metadata = fields
-            .metadata
-            .as_ref()
-            .map(|object| serde_json::Value::from(object.clone()).to_string());
+        self.captured_at = fields.captured_at.map(Timestamp::unix_micros);
+        self.metadata = fields.metadata.as_ref().map(Metadata::to_string);
     }
 
     pub(super) fn checksum(&self) -> i64 {
@@ -168,7 +164,7 @@ impl ReferenceRow {
         }
     }
 
-    pub(super) fn captured_at(&self) -> Result<Option<OffsetDateTime>, RowError> {
+    pub(super) fn captured_at(&self) -> Result<Option<Timestamp>, RowError> {
         self.captured_at.map(from_micros).transpose()
     }
 
@@ -182,10 +178,7 @@ impl ReferenceRow {
             None => None,
         };
         let metadata = match &self.metadata {
-            Some(text) => Some(
-                serde_json::from_str(text)
-                    .map_err(|error| RowError::Damaged(format!("metadata: {error}")))?,
-            ),
+            Some(text) => Some(Metadata::from_stored(text.clone()).map_err(RowError::damaged)?),
             None => None,
         };
         Ok(ReferenceFields {
@@ -275,6 +268,17 @@ pub(super) fn locate(connection: &Connection, id: ReferenceId) -> Result<Located
             None => failed("finding a reference")(error),
         }),
     }
+}
+
+/// The name of the map that a reference is of, found without reading the reference's row.
+pub(super) fn map_of(connection: &Connection, id: ReferenceId) -> Result<MapName, StoreError> {
+    let map = locate(connection, id)?.map;
+    let name: String = connection
+        .prepare_cached("SELECT name FROM map WHERE number = ?1")
+        .and_then(|mut statement| statement.query_row([map], |row| row.get("name")))
+        .map_err(failed("finding the map of a reference"))?;
+    name.parse()
+        .map_err(|_| StoreError::CorruptMap { map: name })
 }
 
 /// The identity in a row that may be unreadable otherwise; all zeros if even that is lost.

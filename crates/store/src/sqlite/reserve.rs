@@ -9,7 +9,7 @@
 use super::directory::io;
 use crate::config::StoreConfig;
 use crate::error::StoreError;
-use placeformer_core::files::directory_of;
+use placeformer_core::files::{create_private_file, directory_of};
 use std::fs::File;
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
@@ -90,6 +90,7 @@ impl Reserve {
         if bytes < self.bytes / 2 {
             return Err(ErrorKind::StorageFull.into());
         }
+        create_private_file(&self.path)?;
         let mut file = File::create(&self.path)?;
         let zeros = vec![0u8; 1 << 20];
         let mut remaining = bytes;

@@ -2,9 +2,8 @@
 
 use super::engine::{damage, failed};
 use crate::error::StoreError;
-use placeformer_core::types::ReferenceId;
+use placeformer_core::types::{ReferenceId, Timestamp};
 use rusqlite::{Row, RowIndex};
-use time::{OffsetDateTime, UtcOffset};
 
 /// Why a row could not be read.
 #[derive(Debug)]
@@ -59,21 +58,8 @@ pub(super) fn id_or_zeros(id: rusqlite::Result<[u8; 16]>) -> ReferenceId {
     ReferenceId::from_bytes(id.unwrap_or([0; 16]))
 }
 
-/// Microseconds since 1970; finer parts are cut.
-pub(super) fn to_micros(time: OffsetDateTime) -> i64 {
-    // Lossless: the years -9999 to 9999 span 6.4e17 microseconds.
-    time.unix_timestamp_nanos().div_euclid(1000) as i64
-}
-
-/// The inverse of [`to_micros`].
-pub(super) fn from_micros(micros: i64) -> Result<OffsetDateTime, RowError> {
-    OffsetDateTime::from_unix_timestamp_nanos(i128::from(micros) * 1000)
-        .map_err(|_| RowError::Damaged(format!("{micros} is not a time")))
-}
-
-/// The instant as the store keeps it: whole microseconds, UTC.
-pub(super) fn as_stored(time: OffsetDateTime) -> OffsetDateTime {
-    let time = time.to_offset(UtcOffset::UTC);
-    let whole_micros = time.nanosecond() / 1000 * 1000;
-    time.replace_nanosecond(whole_micros).unwrap_or(time)
+/// An instant out of a column of microseconds since 1970.
+pub(super) fn from_micros(micros: i64) -> Result<Timestamp, RowError> {
+    Timestamp::from_stored_micros(micros)
+        .ok_or_else(|| RowError::Damaged(format!("{micros} is not a time")))
 }

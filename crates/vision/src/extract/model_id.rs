@@ -145,7 +145,9 @@ mod tests {
     const BACKBONE: &str = "dinov2-vits14:0f1e2d3c4b5a:b8";
 
     fn head(aggregate: Aggregate, seed: f32) -> Head {
-        let weight = vec![seed; GLOBAL_DIM * aggregate.pooled_dim(4)];
+        let weight = (0..GLOBAL_DIM * aggregate.pooled_dim(4))
+            .map(|i| seed + (i * 37 % 101) as f32)
+            .collect();
         Head::new(
             aggregate,
             weight,

@@ -2,9 +2,13 @@
 
 use super::error::ExtractError;
 use half::{bf16, f16};
+use placeformer_core::types::Metadata;
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+
+/// The length of the header comes first, as a 64-bit integer.
+const HEADER_LENGTH_BYTES: usize = 8;
 
 /// A safetensors file in memory: its tensors, and the metadata in its header.
 pub(super) struct TensorFile<'a> {
@@ -18,14 +22,22 @@ impl<'a> TensorFile<'a> {
     /// Parses `bytes`, the content of the file at `path`.
     ///
     /// # Errors
-    /// [`ExtractError::BadFile`] if the bytes are not a complete safetensors file.
+    /// [`ExtractError::BadFile`] if the bytes are not a complete safetensors file, or a name occurs
+    /// twice in its header.
     pub fn parse(bytes: &'a [u8], path: &Path) -> Result<Self, ExtractError> {
         let broken = |error: SafeTensorError| ExtractError::BadFile {
             path: path.to_owned(),
             reason: format!("truncated or not a safetensors file: {error}"),
         };
-        let (_, header) = SafeTensors::read_metadata(bytes).map_err(broken)?;
+        let (header_bytes, header) = SafeTensors::read_metadata(bytes).map_err(broken)?;
         let tensors = SafeTensors::deserialize(bytes).map_err(broken)?;
+        // The reader above takes the last of several; another reader may take the first.
+        let (_, rest) = bytes.split_at(HEADER_LENGTH_BYTES);
+        let header_text = String::from_utf8_lossy(&rest[..header_bytes]);
+        Metadata::parse(&header_text).map_err(|error| ExtractError::BadFile {
+            path: path.to_owned(),
+            reason: format!("its header is ambiguous: {}", error.reason),
+        })?;
         Ok(Self {
             path: path.to_owned(),
             tensors,

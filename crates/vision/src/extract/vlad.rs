@@ -16,6 +16,10 @@ use std::ops::Range;
 /// two words and could change sides for ever.
 const MOST_ROUNDS: usize = 100;
 
+/// Largest length of a visual word. Words are means of tokens of unit length, so that theirs is at
+/// most 1. All residuals to a word that is far away point in one direction, whatever the image.
+const LONGEST_WORD: f64 = 10.0;
+
 /// The visual words of a VLAD.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VladWords {
@@ -28,8 +32,8 @@ impl VladWords {
     /// Takes words `[words, dim]`.
     ///
     /// # Errors
-    /// A sentence for people, if there is no word, a word is not `dim` long, or a value is not
-    /// finite.
+    /// A sentence for people, if there is no word, a word is not `dim` long or far too long as a
+    /// vector, or a value is not finite.
     pub fn new(words: Vec<f32>, dim: usize) -> Result<Self, String> {
         let is_whole = dim > 0 && !words.is_empty() && words.len().is_multiple_of(dim);
         let is_finite = words.iter().all(|value| value.is_finite());
@@ -37,6 +41,19 @@ impl VladWords {
             let len = words.len();
             return Err(format!(
                 "visual words must be finite rows of one length; {len} values do not fit"
+            ));
+        }
+        let length = |word: &[f32]| -> f64 {
+            let squares = word.iter().map(|&value| f64::from(value).powi(2));
+            squares.sum::<f64>().sqrt()
+        };
+        if let Some(far) = words
+            .chunks_exact(dim)
+            .map(length)
+            .find(|length| *length > LONGEST_WORD)
+        {
+            return Err(format!(
+                "a visual word is {far:e} long; the tokens it stands for have length 1"
             ));
         }
         Ok(Self { words, dim })

@@ -5,10 +5,10 @@
 
 use ::exif::{Exif, In, Rational, Reader, Tag, Value};
 use ::image::metadata::Orientation;
-use placeformer_core::types::{GeoPoint, Heading};
+use placeformer_core::types::{GeoPoint, Heading, Timestamp};
 use std::io::Cursor;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use time::{Date, Month, OffsetDateTime, PrimitiveDateTime, Time, UtcOffset};
+use time::{Date, Month, PrimitiveDateTime, Time, UtcOffset};
 
 /// Where, in which direction and when a photo was taken, as far as its EXIF data says so.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -20,7 +20,7 @@ pub struct ExifInfo {
     pub heading: Option<Heading>,
     /// DateTimeOriginal with its UTC offset. Without an offset it is the GPS time, which is in UTC;
     /// without that too, DateTimeOriginal is taken as UTC.
-    pub captured_at: Option<OffsetDateTime>,
+    pub captured_at: Option<Timestamp>,
 }
 
 /// Reads position, direction and time from a JPEG, PNG or WebP.
@@ -94,12 +94,15 @@ fn heading(exif: &Exif) -> Option<Heading> {
     Heading::new(degrees).ok()
 }
 
-fn captured_at(exif: &Exif) -> Option<OffsetDateTime> {
+fn captured_at(exif: &Exif) -> Option<Timestamp> {
     let local = ascii(exif, Tag::DateTimeOriginal).and_then(|text| local_time(&text));
     let offset = ascii(exif, Tag::OffsetTimeOriginal).and_then(|text| utc_offset(&text));
     match (local, offset) {
-        (Some(local), Some(offset)) => Some(local.assume_offset(offset)),
-        (local, _) => gps_time(exif).or(local.map(PrimitiveDateTime::assume_utc)),
+        (Some(local), Some(offset)) => Timestamp::of(local.assume_offset(offset)),
+        (local, _) => {
+            let utc = gps_time(exif).or(local)?;
+            Timestamp::of(utc.assume_utc())
+        }
     }
 }
 
@@ -143,7 +146,8 @@ fn utc_offset(text: &str) -> Option<UtcOffset> {
     UtcOffset::from_hms(sign * hours, sign * minutes, 0).ok()
 }
 
-fn gps_time(exif: &Exif) -> Option<OffsetDateTime> {
+/// The time of the receiver, which is in UTC.
+fn gps_time(exif: &Exif) -> Option<PrimitiveDateTime> {
     let day = date(&ascii(exif, Tag::GPSDateStamp)?)?;
     let clock = rationals(exif, Tag::GPSTimeStamp)?;
     let part = |i: usize| {
@@ -151,7 +155,7 @@ fn gps_time(exif: &Exif) -> Option<OffsetDateTime> {
         (0.0..60.0).contains(&value).then_some(value as u8)
     };
     let time = Time::from_hms(part(0)?, part(1)?, part(2)?).ok()?;
-    Some(PrimitiveDateTime::new(day, time).assume_utc())
+    Some(PrimitiveDateTime::new(day, time))
 }
 
 /// The values of a tag of rational numbers, of which there is at least one.

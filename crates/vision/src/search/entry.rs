@@ -1,7 +1,6 @@
 //! What goes into an index, and what comes out.
 
-use placeformer_core::types::{GLOBAL_DIM, GeoPoint, ReferenceId};
-use time::OffsetDateTime;
+use placeformer_core::types::{GLOBAL_DIM, GeoPoint, ReferenceId, Timestamp};
 
 /// One reference of a map, as the index needs it.
 #[derive(Debug, Clone, PartialEq)]
@@ -13,7 +12,7 @@ pub struct IndexEntry {
     /// Where it was taken, for the geographic filter.
     pub location: Option<GeoPoint>,
     /// When it was taken, for the time filter.
-    pub captured_at: Option<OffsetDateTime>,
+    pub captured_at: Option<Timestamp>,
 }
 
 impl IndexEntry {

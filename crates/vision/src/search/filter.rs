@@ -5,8 +5,7 @@
 //! the box is outside the circle; and if the ranges of a whole block of references do not overlap
 //! the box, none of its rows has to be looked at.
 
-use placeformer_core::types::{GeoCircle, GeoPoint, ReferenceFilter};
-use time::OffsetDateTime;
+use placeformer_core::types::{GeoCircle, GeoPoint, ReferenceFilter, Timestamp};
 
 /// Smaller than any radius of the Earth that is in use, so that boxes are never too small.
 const SMALL_EARTH_RADIUS_M: f64 = 6_350_000.0;
@@ -21,11 +20,11 @@ pub(super) struct PlaceAndTime {
     /// outside every box.
     lat: f64,
     lon: f64,
-    captured_at: Option<OffsetDateTime>,
+    captured_at: Option<Timestamp>,
 }
 
 impl PlaceAndTime {
-    pub(super) fn new(location: Option<GeoPoint>, captured_at: Option<OffsetDateTime>) -> Self {
+    pub(super) fn new(location: Option<GeoPoint>, captured_at: Option<Timestamp>) -> Self {
         let (lat, lon) = location.map_or((f64::NAN, f64::NAN), |point| (point.lat(), point.lon()));
         Self {
             lat,
@@ -45,7 +44,7 @@ impl PlaceAndTime {
 pub(super) struct Extent {
     lat: (f64, f64),
     lon: (f64, f64),
-    captured_at: Option<(OffsetDateTime, OffsetDateTime)>,
+    captured_at: Option<(Timestamp, Timestamp)>,
 }
 
 impl Default for Extent {
@@ -189,8 +188,8 @@ mod tests {
         (near_a_pole, near_the_date_line).prop_map(|(lat, lon)| GeoPoint::new(lat, lon).unwrap())
     }
 
-    fn instant() -> impl Strategy<Value = OffsetDateTime> {
-        (0i64..100).prop_map(|seconds| OffsetDateTime::from_unix_timestamp(seconds).unwrap())
+    fn instant() -> impl Strategy<Value = Timestamp> {
+        (0i64..100).prop_map(|seconds| Timestamp::from_unix_micros(seconds * 1_000_000).unwrap())
     }
 
     proptest! {

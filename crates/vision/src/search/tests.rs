@@ -3,12 +3,13 @@
 use super::block::CAPACITY;
 use super::nearest::squared_distance;
 use super::{IndexEntry, MapIndex, Neighbour};
-use placeformer_core::types::{GLOBAL_DIM, GeoCircle, GeoPoint, ReferenceFilter, ReferenceId};
+use placeformer_core::types::{
+    GLOBAL_DIM, GeoCircle, GeoPoint, ReferenceFilter, ReferenceId, Timestamp,
+};
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
-use time::OffsetDateTime;
 
 fn id(number: u64) -> ReferenceId {
     ReferenceId::from_bytes((u128::from(number) << 32).to_be_bytes())
@@ -74,7 +75,7 @@ fn entry(number: u64, kind: Kind, seed: u64) -> IndexEntry {
     let location = located.then(|| GeoPoint::new(51.0 + (seed % 97) as f64 * 1e-3, 7.0).unwrap());
     let timed = !seed.is_multiple_of(5);
     let captured_at =
-        timed.then(|| OffsetDateTime::from_unix_timestamp((seed % 89) as i64).unwrap());
+        timed.then(|| Timestamp::from_unix_micros((seed % 89) as i64 * 1_000_000).unwrap());
     IndexEntry {
         id: id(number),
         global: vector(kind, seed),
@@ -105,8 +106,8 @@ fn brute_force<'a>(
 
 fn filters() -> Vec<ReferenceFilter> {
     let near = Some(GeoCircle::new(GeoPoint::new(51.02, 7.0).unwrap(), 1500.0).unwrap());
-    let after = Some(OffsetDateTime::from_unix_timestamp(20).unwrap());
-    let before = Some(OffsetDateTime::from_unix_timestamp(40).unwrap());
+    let after = Some(Timestamp::from_unix_micros(20 * 1_000_000).unwrap());
+    let before = Some(Timestamp::from_unix_micros(40 * 1_000_000).unwrap());
     vec![
         ReferenceFilter::default(),
         ReferenceFilter {

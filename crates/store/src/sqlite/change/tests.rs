@@ -1,13 +1,14 @@
 use super::*;
 use crate::config::StoreConfig;
 use crate::sqlite::SqliteStore;
-use crate::{Inserted, WritePlaces};
+use crate::{Inserted, MaintainPlaces, ReadPlaces, WritePlaces};
 use placeformer_core::types::{
     Descriptor, GLOBAL_DIM, NewReference, PackedPatches, PatchGrid, PoolingStride,
 };
 use tempfile::TempDir;
 
-fn new_reference() -> NewReference {
+/// A reference without any fields.
+pub(in crate::sqlite) fn new_reference() -> NewReference {
     let patches = PackedPatches {
         grid: PatchGrid {
             columns: 8,
@@ -45,14 +46,14 @@ fn store_with_one() -> (TempDir, ReferenceId) {
     (directory, reference.id)
 }
 
-fn config() -> StoreConfig {
+pub(in crate::sqlite) fn config() -> StoreConfig {
     StoreConfig {
         reserve_bytes: 1 << 20,
         ..StoreConfig::default()
     }
 }
 
-fn connect(directory: &TempDir) -> Connection {
+pub(in crate::sqlite) fn connect(directory: &TempDir) -> Connection {
     Connection::open(directory.path().join(SqliteStore::DATABASE)).unwrap()
 }
 
@@ -115,4 +116,65 @@ fn a_conflict_names_the_reference_that_has_the_external_id() {
         Err(StoreError::ExternalIdConflict { existing, .. }) => assert_eq!(existing, owner.id),
         other => panic!("{other:?}"),
     }
+}
+
+/// Changes the row of a reference in a closed store, as another release would have written it.
+pub(in crate::sqlite) fn rewrite(
+    directory: &TempDir,
+    id: ReferenceId,
+    change: impl FnOnce(&mut ReferenceRow),
+) {
+    let connection = connect(directory);
+    let number = locate(&connection, id).unwrap().number;
+    let row = read_by_number(&connection, number, |columns, row| columns.read(row));
+    let mut row = row.unwrap().unwrap();
+    change(&mut row);
+    connection
+        .execute(
+            "UPDATE reference SET id = ?1, captured_at = ?2, metadata = ?3, checksum = ?4
+             WHERE number = ?5",
+            (
+                row.id.as_slice(),
+                row.captured_at,
+                &row.metadata,
+                row.checksum(),
+                number,
+            ),
+        )
+        .unwrap();
+}
+
+#[test]
+fn a_time_that_an_earlier_release_stored_beyond_the_years_is_read_as_the_nearest() {
+    let (directory, id) = store_with_one();
+    // 0000-01-01T00:00:00+23:59, in UTC.
+    let beyond = Timestamp::EARLIEST.unix_micros() - (23 * 60 + 59) * 60 * 1_000_000;
+    rewrite(&directory, id, |row| row.captured_at = Some(beyond));
+    let store = SqliteStore::open(directory.path(), &config()).unwrap();
+    let city = "city".parse().unwrap();
+    let expected = Some(Timestamp::EARLIEST);
+    assert_eq!(store.get(id).unwrap().fields.captured_at, expected);
+    let listed = store.list(Some(&city), None, 10).unwrap().references;
+    assert_eq!(listed[0].fields.captured_at, expected);
+    let mut scanned = Vec::new();
+    store
+        .scan_globals(&city, &mut |row| scanned.push(row.captured_at))
+        .unwrap();
+    assert_eq!(scanned, [expected]);
+    assert_eq!(store.verify().unwrap().damaged, []);
+    let changed = store.update(id, ReferencePatch::default()).unwrap();
+    assert_eq!(changed.fields.captured_at, expected);
+    assert_eq!(store.quarantined().unwrap(), []);
+}
+
+#[test]
+fn metadata_that_an_earlier_release_stored_is_still_read() {
+    let (directory, id) = store_with_one();
+    let deep = format!("{{\"a\":{}1{}}}", "[".repeat(120), "]".repeat(120));
+    rewrite(&directory, id, |row| row.metadata = Some(deep.clone()));
+    let store = SqliteStore::open(directory.path(), &config()).unwrap();
+    assert_eq!(
+        store.get(id).unwrap().fields.metadata.unwrap().as_str(),
+        deep
+    );
 }

@@ -5,9 +5,10 @@
 //! backbone and its pooling, and is refused elsewhere.
 //!
 //! The pooled vector is L2-normalised, multiplied by W `[256, d]`, shifted by b `[256]`, and
-//! L2-normalised again. `projection` does that; `file` reads and writes heads, and knows those that
-//! are built into the binary.
+//! L2-normalised again. `projection` does that; `check` refuses heads that cannot; `file` reads and
+//! writes heads, and knows those that are built into the binary.
 
+mod check;
 mod file;
 mod projection;
 #[cfg(test)]

@@ -3,6 +3,7 @@
 use crate::extract::aggregate::Aggregate;
 use crate::extract::error::ExtractError;
 use crate::extract::global::l2_normalise;
+use crate::extract::head::check;
 use placeformer_core::types::GLOBAL_DIM;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -32,7 +33,8 @@ impl Head {
     /// length of the vectors that `aggregate` makes. `notes` say how it was made.
     ///
     /// # Errors
-    /// [`ExtractError::BadFile`] if the shapes do not fit, or a value is not finite.
+    /// [`ExtractError::BadFile`] if the shapes do not fit, a value is not finite or too large to
+    /// compute with, a row of the weight is zero, or the head maps different images to one place.
     pub fn new(
         aggregate: Aggregate,
         weight: Vec<f32>,
@@ -41,18 +43,22 @@ impl Head {
         notes: BTreeMap<String, String>,
     ) -> Result<Self, ExtractError> {
         let dim = weight.len() / GLOBAL_DIM;
-        check_shapes(&aggregate, &weight, &bias).map_err(|reason| ExtractError::BadFile {
+        let broken = |reason| ExtractError::BadFile {
             path: "head".into(),
             reason,
-        })?;
-        Ok(Self {
+        };
+        check::shapes(&aggregate, &weight, &bias).map_err(broken)?;
+        check::magnitudes(&weight, &bias).map_err(broken)?;
+        let head = Self {
             aggregate,
             weight,
             bias,
             dim,
             backbone: backbone.into(),
             notes,
-        })
+        };
+        check::tells_images_apart(&head).map_err(broken)?;
+        Ok(head)
     }
 
     /// The same head with another `weight` `[256, d]` and `bias` `[256]`, as training makes it, and
@@ -167,26 +173,4 @@ impl Head {
         }
         projected
     }
-}
-
-/// Says what is wrong with the parts of a head.
-fn check_shapes(aggregate: &Aggregate, weight: &[f32], bias: &[f32]) -> Result<(), String> {
-    let dim = weight.len() / GLOBAL_DIM;
-    let has_shapes = dim > 0 && weight.len() == dim * GLOBAL_DIM && bias.len() == GLOBAL_DIM;
-    let is_finite = weight.iter().chain(bias).all(|value| value.is_finite());
-    if !has_shapes || !is_finite {
-        return Err(format!(
-            "a head needs a finite [{GLOBAL_DIM}, d] weight and a [{GLOBAL_DIM}] bias"
-        ));
-    }
-    if let Aggregate::Vlad(words) = aggregate {
-        let count = words.count();
-        let length = words.values().len();
-        if length != dim {
-            return Err(format!(
-                "weight takes {dim} values, its {count} visual words make {length}"
-            ));
-        }
-    }
-    Ok(())
 }

@@ -214,3 +214,101 @@ fn a_stored_vector_of_another_length_is_refused() {
         }
     }
 }
+
+/// The bytes of a file whose weight and bias these functions of row and column make.
+fn file_of(weight: impl Fn(usize, usize) -> f32, bias: impl Fn(usize) -> f32) -> Vec<u8> {
+    let weight: Vec<f32> = (0..GLOBAL_DIM * 8).map(|i| weight(i / 8, i % 8)).collect();
+    let bias: Vec<f32> = (0..GLOBAL_DIM).map(bias).collect();
+    let view = |shape: &[usize], values: &[f32]| {
+        let bytes = bytemuck::cast_slice::<f32, u8>(values).to_vec();
+        (shape.to_vec(), bytes)
+    };
+    let parts = [
+        ("weight", view(&[GLOBAL_DIM, 8], &weight)),
+        ("bias", view(&[GLOBAL_DIM], &bias)),
+    ];
+    let tensors = parts.iter().map(|(name, (shape, bytes))| {
+        (
+            *name,
+            TensorView::new(Dtype::F32, shape.clone(), bytes).unwrap(),
+        )
+    });
+    let meta: HashMap<_, _> = [("backbone".to_owned(), "x".to_owned())].into();
+    safetensors::serialize(tensors, Some(meta)).unwrap()
+}
+
+/// Numbers without a pattern, from -1 to 1.
+fn some(row: usize, column: usize) -> f32 {
+    (((row * 8 + column) * 37) % 101) as f32 / 50.0 - 1.0
+}
+
+#[test]
+fn a_head_that_cannot_tell_images_apart_is_refused_when_it_is_loaded() {
+    let refusal = |file: Vec<u8>| {
+        let loaded = Head::from_bytes(&file, Path::new("h.safetensors"));
+        loaded
+            .err()
+            .map(|error| error.to_string())
+            .unwrap_or_default()
+    };
+    assert_eq!(refusal(file_of(some, |_| 0.5)), "");
+    assert_eq!(refusal(file_of(|r, c| 1e-6 * some(r, c), |_| 0.0)), "");
+    assert_eq!(refusal(file_of(|r, c| 1e6 * some(r, c), |_| 1e3)), "");
+    let largest = |r: usize, c: usize| {
+        if (r, c) == (255, 7) {
+            f32::MAX
+        } else {
+            some(r, c)
+        }
+    };
+    let zero_row = |r: usize, c: usize| if r == 17 { -0.0 } else { some(r, c) };
+    let one_direction = |row: usize, column: usize| some(0, column) * some(row, 3).max(0.1);
+    for (file, part) in [
+        (file_of(|_, _| 3e38, |_| 0.0), "overflow"),
+        (file_of(largest, |_| 0.0), "overflow"),
+        (
+            file_of(some, |row| if row == 3 { -3e38 } else { 0.0 }),
+            "overflow",
+        ),
+        (file_of(|_, _| f32::NAN, |_| 0.0), "not finite"),
+        (file_of(some, |_| f32::INFINITY), "not finite"),
+        (file_of(|_, _| 0.0, |_| 0.0), "all zeros"),
+        (file_of(|_, _| 0.0, |_| 1.0), "all zeros"),
+        (file_of(zero_row, |_| 0.5), "row 17"),
+        (file_of(|_, _| 1.0, |_| 0.0), "same global descriptor"),
+        (file_of(one_direction, |_| 0.0), "same global descriptor"),
+        (
+            file_of(|r, c| 1e-9 * some(r, c), |_| 1.0),
+            "same global descriptor",
+        ),
+        (file_of(|_, _| 1e-45, |_| 0.0), "same global descriptor"),
+    ] {
+        let refusal = refusal(file);
+        assert!(refusal.contains(part), "{part}: {refusal}");
+    }
+}
+
+#[test]
+fn visual_words_far_from_every_token_are_refused() {
+    for length in [1e3, 3e38] {
+        let error = VladWords::new(vec![0.0, 0.5, length, 0.0], 2).unwrap_err();
+        assert!(error.contains("long"), "{error}");
+    }
+    VladWords::new(vec![0.0, 0.5, 1.0, 0.0], 2).unwrap();
+}
+
+#[test]
+fn a_name_that_occurs_twice_in_the_header_is_refused() {
+    let file = file_of(some, |_| 0.5);
+    let length = u64::from_le_bytes(file[..8].try_into().unwrap()) as usize;
+    let header = std::str::from_utf8(&file[8..8 + length]).unwrap();
+    let twice = header.replace("\"backbone\":", "\"backbone\":\"y\",\"backbone\":");
+    assert_ne!(twice, header);
+    let mut forged = (twice.len() as u64).to_le_bytes().to_vec();
+    forged.extend_from_slice(twice.as_bytes());
+    forged.extend_from_slice(&file[8 + length..]);
+    let error = Head::from_bytes(&forged, Path::new("h"))
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("occurs twice"), "{error}");
+}

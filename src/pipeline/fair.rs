@@ -1,0 +1,397 @@
+//! Permits for which callers take turns, so that whoever asks often does not push out whoever asks
+//! seldom.
+//!
+//! Each caller has a line of its own, in which the first to wait is the first to be served. A
+//! permit that becomes free goes to the caller whose turn it is, and that caller then goes to the
+//! end of the round. So a request waits for at most one other of each caller per request of its own
+//! caller that is ahead of it, however long the lines of the others are.
+//!
+//! Whoever has time may wait behind the lines: it is served when nobody is left in them who came
+//! before it. So one who comes to a line waits for those only who waited behind the lines already.
+
+use super::caller::Caller;
+use std::collections::{HashMap, VecDeque};
+use std::hash::Hash;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use tokio::sync::oneshot;
+
+/// A number of permits for which callers take turns. Clones share the permits.
+#[derive(Clone)]
+pub(super) struct FairSemaphore(Arc<Mutex<State>>);
+
+struct State {
+    /// Permits that nobody has. While there are any, nobody waits.
+    free: usize,
+    lines: Turns<Caller, Waiting>,
+    /// Those who wait behind the lines, the first first.
+    behind: VecDeque<Waiting>,
+    /// Counts those who had to wait, so that it is known who came first.
+    arrivals: u64,
+}
+
+/// One who waits.
+struct Waiting {
+    arrival: u64,
+    granted: oneshot::Sender<()>,
+}
+
+/// A permit; given back when dropped.
+pub(super) struct FairPermit(FairSemaphore);
+
+impl FairSemaphore {
+    pub(super) fn new(permits: usize) -> Self {
+        Self(Arc::new(Mutex::new(State {
+            free: permits,
+            lines: Turns::default(),
+            behind: VecDeque::new(),
+            arrivals: 0,
+        })))
+    }
+
+    /// Waits for a permit in the line of `caller`.
+    ///
+    /// Cancel safety: dropped while waiting, the request leaves the line; a permit that it was
+    /// granted at that moment goes to the next.
+    pub(super) async fn acquire(&self, caller: &Caller) -> FairPermit {
+        self.acquire_in(Some(caller)).await
+    }
+
+    /// Waits for a permit behind those who are in the lines now.
+    ///
+    /// Cancel safety: as of [`FairSemaphore::acquire`].
+    pub(super) async fn acquire_behind(&self) -> FairPermit {
+        self.acquire_in(None).await
+    }
+
+    async fn acquire_in(&self, line: Option<&Caller>) -> FairPermit {
+        let place = {
+            let mut state = self.lock();
+            if state.free > 0 {
+                state.free -= 1;
+                return FairPermit(self.clone());
+            }
+            state.enqueue(self, line)
+        };
+        place.granted().await
+    }
+
+    /// Hands a permit that was given back to the next.
+    fn release(&self) {
+        let mut state = self.lock();
+        match state.next() {
+            // Whoever stops waiting leaves the line first, so that somebody receives this.
+            Some(next) => {
+                let _ = next.granted.send(());
+            }
+            None => state.free += 1,
+        }
+    }
+
+    // A thread that panics with the lock leaves the state whole, because nothing between its
+    // changes can panic. So a poisoned lock can be used all the same.
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Drop for FairPermit {
+    fn drop(&mut self) {
+        self.0.release();
+    }
+}
+
+impl State {
+    fn enqueue(&mut self, semaphore: &FairSemaphore, line: Option<&Caller>) -> Place {
+        let (granted, receiver) = oneshot::channel();
+        let arrival = self.arrivals;
+        self.arrivals += 1;
+        let waiting = Waiting { arrival, granted };
+        match line {
+            Some(caller) => self.lines.push(caller.clone(), waiting),
+            None => self.behind.push_back(waiting),
+        }
+        Place {
+            semaphore: semaphore.clone(),
+            line: line.cloned(),
+            arrival,
+            granted: receiver,
+            is_settled: false,
+        }
+    }
+
+    /// Takes out who is served next.
+    fn next(&mut self) -> Option<Waiting> {
+        let first_behind = self.behind.front().map(|waiting| waiting.arrival);
+        let oldest = self.lines.fronts().map(|waiting| waiting.arrival).min();
+        match (first_behind, oldest) {
+            (Some(behind), Some(oldest)) if oldest < behind => self.lines.pop(),
+            (Some(_), _) => self.behind.pop_front(),
+            (None, _) => self.lines.pop(),
+        }
+    }
+
+    /// Takes out one who stops waiting; false if it has been granted a permit already.
+    fn remove(&mut self, line: Option<&Caller>, arrival: u64) -> bool {
+        let is_it = |waiting: &Waiting| waiting.arrival == arrival;
+        match line {
+            Some(caller) => self.lines.remove(caller, is_it),
+            None => match self.behind.iter().position(is_it) {
+                Some(position) => self.behind.remove(position).is_some(),
+                None => false,
+            },
+        }
+    }
+}
+
+/// A place in a line, or behind the lines, of one who waits.
+struct Place {
+    semaphore: FairSemaphore,
+    line: Option<Caller>,
+    arrival: u64,
+    granted: oneshot::Receiver<()>,
+    /// Whether there is nothing left to clear up.
+    is_settled: bool,
+}
+
+impl Place {
+    async fn granted(mut self) -> FairPermit {
+        // The sender stays in the line until it sends, so that this cannot fail.
+        let _ = (&mut self.granted).await;
+        self.is_settled = true;
+        FairPermit(self.semaphore.clone())
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        if self.is_settled {
+            return;
+        }
+        let was_waiting = self
+            .semaphore
+            .lock()
+            .remove(self.line.as_ref(), self.arrival);
+        if !was_waiting {
+            self.semaphore.release();
+        }
+    }
+}
+
+/// Lines of values, one for each key, that are served in turn.
+struct Turns<K, V> {
+    /// No line is empty.
+    lines: HashMap<K, VecDeque<V>>,
+    /// Every key that has a line, the one whose turn it is first.
+    round: VecDeque<K>,
+}
+
+impl<K, V> Default for Turns<K, V> {
+    fn default() -> Self {
+        Self {
+            lines: HashMap::new(),
+            round: VecDeque::new(),
+        }
+    }
+}
+
+impl<K: Clone + Eq + Hash, V> Turns<K, V> {
+    /// Adds a value to the end of the line of `key`. A new line goes to the end of the round.
+    fn push(&mut self, key: K, value: V) {
+        let line = self.lines.entry(key.clone()).or_insert_with(|| {
+            self.round.push_back(key);
+            VecDeque::new()
+        });
+        line.push_back(value);
+    }
+
+    /// Takes the first value of the line whose turn it is; the line goes to the end of the round.
+    fn pop(&mut self) -> Option<V> {
+        let key = self.round.pop_front()?;
+        let line = self.lines.get_mut(&key)?;
+        let value = line.pop_front();
+        if line.is_empty() {
+            self.lines.remove(&key);
+        } else {
+            self.round.push_back(key);
+        }
+        value
+    }
+
+    /// Takes the first value of a line for which `is_it` holds out of it; false if there is none.
+    fn remove(&mut self, key: &K, is_it: impl Fn(&V) -> bool) -> bool {
+        let Some(line) = self.lines.get_mut(key) else {
+            return false;
+        };
+        let Some(position) = line.iter().position(is_it) else {
+            return false;
+        };
+        line.remove(position);
+        if line.is_empty() {
+            self.lines.remove(key);
+            self.round.retain(|other| other != key);
+        }
+        true
+    }
+
+    /// The first value of each line.
+    fn fronts(&self) -> impl Iterator<Item = &V> {
+        self.lines.values().filter_map(VecDeque::front)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use futures_util::FutureExt;
+    use futures_util::future::BoxFuture;
+    use proptest::prelude::*;
+
+    fn caller(name: usize) -> Caller {
+        Caller::Key(name.to_string().into())
+    }
+
+    /// A waiter that has been polled once, so that it is in its line.
+    fn queued<'a>(
+        waiting: impl Future<Output = FairPermit> + Send + 'a,
+    ) -> BoxFuture<'a, FairPermit> {
+        let mut waiting = waiting.boxed();
+        assert!(
+            (&mut waiting).now_or_never().is_none(),
+            "nobody had to wait"
+        );
+        waiting
+    }
+
+    /// The permit, if it was granted.
+    fn granted(waiting: &mut BoxFuture<'_, FairPermit>) -> Option<FairPermit> {
+        waiting.now_or_never()
+    }
+
+    #[derive(Debug, Clone, Copy)]
+    enum Step {
+        /// This caller asks for a permit.
+        Ask(usize),
+        /// The permit is given back, and the next who waits gets it.
+        Serve,
+        /// Of those who wait, this one leaves.
+        Leave(usize),
+    }
+
+    fn steps() -> impl Strategy<Value = Vec<Step>> {
+        let step = prop_oneof![
+            4 => (0usize..4).prop_map(Step::Ask),
+            // One caller asks as often as all others together.
+            4 => Just(Step::Ask(0)),
+            3 => Just(Step::Serve),
+            1 => (0usize..50).prop_map(Step::Leave),
+        ];
+        prop::collection::vec(step, 1..200)
+    }
+
+    proptest! {
+        #[test]
+        fn callers_take_turns_and_each_keeps_its_order(steps in steps()) {
+            let semaphore = FairSemaphore::new(1);
+            let mut held = Some(semaphore.acquire(&caller(9)).now_or_never().unwrap());
+            let names: Vec<Caller> = (0..4).map(caller).collect();
+            let mut waiting: Vec<(usize, BoxFuture<'_, FairPermit>)> = Vec::new();
+            // Of each caller that waits: whom it has seen being served since it began to.
+            let mut seen: HashMap<usize, Vec<usize>> = HashMap::new();
+            for step in steps.into_iter().chain(std::iter::repeat_n(Step::Serve, 200)) {
+                match step {
+                    Step::Ask(name) => {
+                        if !waiting.iter().any(|(other, _)| *other == name) {
+                            seen.insert(name, Vec::new());
+                        }
+                        waiting.push((name, queued(semaphore.acquire(&names[name]))));
+                    }
+                    Step::Leave(which) if !waiting.is_empty() => {
+                        let (name, future) = waiting.remove(which % waiting.len());
+                        drop(future);
+                        if !waiting.iter().any(|(other, _)| *other == name) {
+                            seen.remove(&name);
+                        }
+                    }
+                    Step::Leave(_) => {}
+                    Step::Serve => {
+                        drop(held.take());
+                        let served = (0..waiting.len())
+                            .find_map(|i| granted(&mut waiting[i].1).map(|permit| (i, permit)));
+                        let Some((position, permit)) = served else {
+                            prop_assert!(waiting.is_empty());
+                            held = Some(semaphore.acquire(&names[0]).now_or_never().unwrap());
+                            continue;
+                        };
+                        held = Some(permit);
+                        let (name, _) = waiting.remove(position);
+                        prop_assert!(
+                            waiting[..position].iter().all(|(other, _)| *other != name),
+                            "one of {name} was served before another of it that came first"
+                        );
+                        for (other, served) in &mut seen {
+                            prop_assert!(
+                                *other == name || !served.contains(&name),
+                                "{name} was served twice while {other} waited for its turn"
+                            );
+                            served.push(name);
+                        }
+                        if waiting.iter().any(|(other, _)| *other == name) {
+                            seen.insert(name, Vec::new());
+                        } else {
+                            seen.remove(&name);
+                        }
+                    }
+                }
+            }
+            prop_assert!(waiting.is_empty(), "{} were never served", waiting.len());
+        }
+    }
+
+    #[test]
+    fn a_permit_granted_to_one_who_leaves_goes_to_the_next() {
+        let semaphore = FairSemaphore::new(1);
+        let [a, b] = [caller(0), caller(1)];
+        let held = semaphore.acquire(&a).now_or_never().unwrap();
+        let leaving = queued(semaphore.acquire(&a));
+        let mut staying = queued(semaphore.acquire(&b));
+        drop(held);
+        drop(leaving);
+        let permit = granted(&mut staying).expect("the permit was lost");
+        drop(permit);
+        assert!(semaphore.acquire(&a).now_or_never().is_some());
+    }
+
+    #[test]
+    fn those_behind_are_served_when_nobody_is_left_who_came_before_them() {
+        let semaphore = FairSemaphore::new(1);
+        let one = caller(0);
+        let held = semaphore.acquire(&one).now_or_never().unwrap();
+        let mut early = queued(semaphore.acquire(&one));
+        let mut behind = queued(semaphore.acquire_behind());
+        let mut late = queued(semaphore.acquire(&one));
+        drop(held);
+        assert!(granted(&mut behind).is_none());
+        drop(granted(&mut early).unwrap());
+        drop(granted(&mut behind).unwrap());
+        let permit = granted(&mut late).unwrap();
+        let mut next_behind = queued(semaphore.acquire_behind());
+        let mut latest = queued(semaphore.acquire(&one));
+        drop(permit);
+        drop(granted(&mut next_behind).unwrap());
+        drop(granted(&mut latest).unwrap());
+    }
+
+    #[test]
+    fn as_many_as_there_are_permits_are_served_at_once() {
+        let semaphore = FairSemaphore::new(3);
+        let names: Vec<Caller> = (0..4).map(caller).collect();
+        let held: Vec<_> = names[..3]
+            .iter()
+            .map(|name| semaphore.acquire(name).now_or_never().unwrap())
+            .collect();
+        let mut fourth = queued(semaphore.acquire(&names[3]));
+        assert!(granted(&mut fourth).is_none());
+        drop(held);
+        assert!(granted(&mut fourth).is_some());
+    }
+}
