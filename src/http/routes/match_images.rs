@@ -134,9 +134,7 @@ pub async fn match_images(
             ));
         }
     };
-    let answer = service
-        .match_images(&access.caller, query, other)
-        .await?;
+    let answer = service.match_images(&access.caller, query, other).await?;
     let timings = answer.timings.clone();
     timed(&state, StatusCode::OK, &timings, move || {
         answer_body(&answer)

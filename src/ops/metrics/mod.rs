@@ -11,8 +11,8 @@ pub use labels::{ConnectionCut, ConnectionKind, MemoryComponent, PipelineStage, 
 use super::logging;
 use placeformer_core::types::MapName;
 use prometheus::core::Collector;
-use prometheus::proto::MetricFamily;
 use prometheus::process_collector::ProcessCollector;
+use prometheus::proto::MetricFamily;
 use prometheus::{
     Encoder, Error, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge,
     IntGaugeVec, Opts, Registry, TextEncoder,
