@@ -3,6 +3,7 @@
 use super::config::ImageConfig;
 use super::error::ImageError;
 use super::header::{self, ImageFormat};
+use super::jpeg;
 use super::rgb::RgbImage;
 use ::image::codecs::{png::PngDecoder, webp::WebPDecoder};
 use ::image::{DynamicImage, ImageDecoder, Limits};
@@ -10,11 +11,6 @@ use placeformer_core::types::ImageSize;
 use std::error::Error;
 use std::io::{self, Cursor, ErrorKind};
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use zune_core::bytestream::ZCursor;
-use zune_core::colorspace::ColorSpace;
-use zune_core::options::DecoderOptions;
-use zune_jpeg::JpegDecoder;
-use zune_jpeg::errors::DecodeErrors;
 
 /// Why a file without all its bytes is refused.
 const ENDS_TOO_EARLY: &str = "truncated: the bytes end too early";
@@ -48,7 +44,7 @@ pub(super) fn decode_as_stored(
     needed: Option<ImageSize>,
 ) -> Result<RgbImage, ImageError> {
     match header::recognise(bytes, config)? {
-        ImageFormat::Jpeg => jpeg(bytes, config, needed),
+        ImageFormat::Jpeg => jpeg::decode(bytes, config, needed),
         ImageFormat::Png => png(bytes, config),
         ImageFormat::WebP => webp(bytes, config),
     }
@@ -77,104 +73,6 @@ fn webp(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError> {
 /// Most bytes that decoded samples may take: RGBA at the pixel limit.
 fn decoded_limit(config: &ImageConfig) -> u64 {
     config.max_pixels.saturating_mul(4)
-}
-
-fn jpeg(
-    bytes: &[u8],
-    config: &ImageConfig,
-    needed: Option<ImageSize>,
-) -> Result<RgbImage, ImageError> {
-    let fail = |error: DecodeErrors| ImageFormat::Jpeg.undecodable(jpeg_reason(&error));
-    // The decoder's own limits are set as high as possible. Ours are checked below, on the header,
-    // with a better message.
-    let options = DecoderOptions::default()
-        .set_strict_mode(true)
-        .set_max_width(usize::from(u16::MAX))
-        .set_max_height(usize::from(u16::MAX))
-        .jpeg_set_max_scans(header::MAX_JPEG_SCANS)
-        .jpeg_set_out_colorspace(ColorSpace::RGB);
-    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
-    decoder.decode_headers().map_err(fail)?;
-    let (width, height) = decoder.dimensions().unwrap_or_default();
-    // The sides of a JPEG are 16-bit numbers, so the conversion loses nothing.
-    let size = ImageSize {
-        width: width as u32,
-        height: height as u32,
-    };
-    header::check_size(ImageFormat::Jpeg, size, config)?;
-    header::check_jpeg(bytes)?;
-
-    let is_plain_colour = decoder.input_colorspace() == Some(ColorSpace::YCbCr);
-    if is_plain_colour
-        && let Some(needed) = needed
-        && let Some(scale) = reduction(size, needed)
-    {
-        return jpeg_reduced(bytes, size, scale, config);
-    }
-    let pixels = decoder.decode().map_err(fail)?;
-    match decoder.output_colorspace() {
-        Some(ColorSpace::RGB) => Ok(RgbImage { size, pixels }),
-        other => {
-            let reason = format!("its colours ({other:?}) cannot be shown as RGB");
-            Err(ImageFormat::Jpeg.undecodable(reason))
-        }
-    }
-}
-
-/// The largest of the reductions 1/8, 1/4 and 1/2 that leaves both sides at least twice as long as
-/// needed; `None` if there is none.
-///
-/// The antialiased resize that follows averages the remaining pixels, so the result differs from
-/// that of a full decode by a level or two of 256.
-fn reduction(size: ImageSize, needed: ImageSize) -> Option<u32> {
-    let leaves_enough = |scale: &u32| {
-        size.width / scale >= 2 * needed.width && size.height / scale >= 2 * needed.height
-    };
-    [8, 4, 2].into_iter().find(leaves_enough)
-}
-
-/// Decodes at `1 / scale` of the size, which needs fewer coefficients and makes fewer pixels.
-fn jpeg_reduced(
-    bytes: &[u8],
-    size: ImageSize,
-    scale: u32,
-    config: &ImageConfig,
-) -> Result<RgbImage, ImageError> {
-    let fail = |error: jpeg_decoder::Error| ImageFormat::Jpeg.undecodable(error.to_string());
-    let limit = usize::try_from(decoded_limit(config)).unwrap_or(usize::MAX);
-    let mut decoder = jpeg_decoder::Decoder::new(bytes);
-    decoder.set_max_decoding_buffer_size(limit);
-    decoder.read_info().map_err(fail)?;
-    // The sides of a JPEG are 16-bit numbers, so the conversion loses nothing.
-    let side = |pixels: u32| pixels.div_ceil(scale) as u16;
-    let (width, height) = decoder
-        .scale(side(size.width), side(size.height))
-        .map_err(fail)?;
-    let pixels = decoder.decode().map_err(fail)?;
-    let reduced = ImageSize {
-        width: u32::from(width),
-        height: u32::from(height),
-    };
-    let expected = u64::from(reduced.width) * u64::from(reduced.height) * 3;
-    if pixels.len() as u64 != expected {
-        return Err(ImageFormat::Jpeg.undecodable("its colours cannot be shown as RGB"));
-    }
-    Ok(RgbImage {
-        size: reduced,
-        pixels,
-    })
-}
-
-/// The decoder's error in words that the sender of the image understands.
-fn jpeg_reason(error: &DecodeErrors) -> String {
-    match error {
-        DecodeErrors::ExhaustedData
-        | DecodeErrors::IoErrors(_)
-        | DecodeErrors::FormatStatic("Premature end of buffer") => ENDS_TOO_EARLY.to_owned(),
-        DecodeErrors::Format(reason) => reason.clone(),
-        DecodeErrors::FormatStatic(reason) => (*reason).to_owned(),
-        other => other.to_string(),
-    }
 }
 
 /// Checks the limits against the decoder's header, and decodes.
@@ -248,21 +146,6 @@ fn is_unexpected_end(error: &(dyn Error + 'static)) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn only_what_is_far_too_large_is_reduced() {
-        let size = |width, height| ImageSize { width, height };
-        assert_eq!(reduction(size(640, 480), size(448, 336)), None);
-        assert_eq!(reduction(size(1920, 1080), size(448, 336)), None);
-        assert_eq!(reduction(size(1920, 1400), size(448, 336)), Some(2));
-        assert_eq!(reduction(size(4032, 3024), size(448, 336)), Some(4));
-        assert_eq!(
-            reduction(size(8000, 700), size(448, 336)),
-            None,
-            "one side would become too short"
-        );
-        assert_eq!(reduction(size(16_000, 12_000), size(448, 336)), Some(8));
-    }
 
     #[test]
     fn a_panic_becomes_an_error_that_quotes_it() {

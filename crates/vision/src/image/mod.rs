@@ -15,6 +15,7 @@
 //! |---|---|
 //! | `load` | the whole way, from bytes to image or tensor |
 //! | `header`, `decode` | format and limits; one decoder for each format |
+//! | `jpeg` | what of a JPEG is accepted, and which library decodes it |
 //! | `orientation` | turning an image upright |
 //! | `resize` | resizing and normalisation |
 //! | `encode` | back to JPEG and PNG |
@@ -26,6 +27,7 @@ mod encode;
 mod error;
 mod exif;
 mod header;
+mod jpeg;
 mod load;
 mod orientation;
 mod resize;
