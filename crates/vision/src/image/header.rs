@@ -1,8 +1,7 @@
 //! The format from the magic bytes, and checks of the header before anything is decoded.
 //!
 //! The PNG decoder allocates buffers according to the size that a file states, so that size is read
-//! here, from the first 24 bytes. The JPEG and WebP decoders read their headers without such
-//! allocations, so they are asked for the size.
+//! here, from the first 24 bytes.
 
 use super::config::ImageConfig;
 use super::error::ImageError;
@@ -111,17 +110,6 @@ pub(super) fn png_size(bytes: &[u8]) -> Result<ImageSize, ImageError> {
         width: u32::from_be_bytes(width),
         height: u32::from_be_bytes(height),
     })
-}
-
-/// Whether a WebP has all the bytes that its RIFF header states. The decoder would at best report a
-/// truncated file as corrupt.
-pub(super) fn webp_is_complete(bytes: &[u8]) -> bool {
-    let Some(stated) = four_bytes(bytes, 4) else {
-        return false;
-    };
-    // The length counts what follows it, and eight bytes come before.
-    let end = u64::from(u32::from_le_bytes(stated)) + 8;
-    bytes.len() as u64 >= end
 }
 
 fn four_bytes(bytes: &[u8], at: usize) -> Option<[u8; 4]> {
