@@ -38,7 +38,11 @@ fn parts() -> (Vec<u8>, Vec<u8>, Vec<u8>) {
         let data = all.iter().filter(|(found, _)| found == kind);
         data.flat_map(|(_, data)| data.clone()).collect()
     };
-    (chunk(b"IHDR", &of(b"IHDR")), of(b"IDAT"), chunk(b"IEND", b""))
+    (
+        chunk(b"IHDR", &of(b"IHDR")),
+        of(b"IDAT"),
+        chunk(b"IEND", b""),
+    )
 }
 
 #[track_caller]
@@ -91,7 +95,10 @@ fn a_png_whose_pixels_are_damaged_or_missing_is_refused() {
         let file = png(&[header.clone(), part, end.clone()]);
         assert_eq!(code(&file), "image_undecodable", "{kept} bytes of pixels");
     }
-    assert_eq!(code(&png(&[header.clone(), end.clone()])), "image_undecodable");
+    assert_eq!(
+        code(&png(&[header.clone(), end.clone()])),
+        "image_undecodable"
+    );
     let flipped = |mut chunk: Vec<u8>| {
         *chunk.last_mut().unwrap() ^= 1;
         chunk
@@ -103,7 +110,11 @@ fn a_png_whose_pixels_are_damaged_or_missing_is_refused() {
     assert_eq!(code(&file), "image_undecodable", "checksum of the pixels");
     let unknown = chunk(b"TEST", b"");
     let file = png(&[header, unknown, pixels, end]);
-    assert_eq!(code(&file), "image_undecodable", "an unknown chunk that matters");
+    assert_eq!(
+        code(&file),
+        "image_undecodable",
+        "an unknown chunk that matters"
+    );
 }
 
 #[test]
@@ -112,7 +123,10 @@ fn of_an_animated_png_the_first_picture_alone_counts() {
     let animation = chunk(b"acTL", &[0, 0, 0, 2, 0, 0, 0, 0]);
     let frame = |number: u8, width: u8| {
         let sides = [[0, 0, 0, width], [0, 0, 0, 32], [0; 4], [0; 4]].concat();
-        chunk(b"fcTL", &[&[0, 0, 0, number], &sides[..], &[0, 1, 0, 10, 0, 0]].concat())
+        chunk(
+            b"fcTL",
+            &[&[0, 0, 0, number], &sides[..], &[0, 1, 0, 10, 0, 0]].concat(),
+        )
     };
     let pixels = chunk(b"IDAT", &pixels);
     let damaged = chunk(b"fdAT", b"\0\0\0\x02rubbish");
@@ -127,7 +141,11 @@ fn of_an_animated_png_the_first_picture_alone_counts() {
     ]);
     assert_is_picture(&file, &picture(), "a damaged second frame");
     let file = png(&[header, animation, frame(0, 24), pixels, end]);
-    assert_eq!(code(&file), "image_undecodable", "a first frame of another size");
+    assert_eq!(
+        code(&file),
+        "image_undecodable",
+        "a first frame of another size"
+    );
 }
 
 /// A WebP of chunks, each filled up to an even length.
@@ -148,9 +166,16 @@ fn extended(flags: u8, width: u8, height: u8) -> [u8; 10] {
 
 /// Kind and data of the picture in both codings.
 fn pictures() -> [([u8; 4], Vec<u8>); 2] {
-    [encoded(&dynamic(), ImageFormat::WebP), fixture("lossy.webp")].map(|file| {
+    [
+        encoded(&dynamic(), ImageFormat::WebP),
+        fixture("lossy.webp"),
+    ]
+    .map(|file| {
         let length = u32::from_le_bytes(file[16..20].try_into().unwrap()) as usize;
-        (file[12..16].try_into().unwrap(), file[20..20 + length].to_vec())
+        (
+            file[12..16].try_into().unwrap(),
+            file[20..20 + length].to_vec(),
+        )
     })
 }
 
@@ -161,15 +186,30 @@ fn what_stands_beside_the_picture_of_a_webp_does_not_matter() {
         let expected = default_decode(&webp(&[picture])).unwrap();
         let all = extended(0b0010_1100, 48, 32);
         for (name, chunks) in [
-            ("metadata", vec![(b"ICCP", b"x".as_slice()), picture, (b"EXIF", b"y"), (b"XMP ", b"z")]),
+            (
+                "metadata",
+                vec![
+                    (b"ICCP", b"x".as_slice()),
+                    picture,
+                    (b"EXIF", b"y"),
+                    (b"XMP ", b"z"),
+                ],
+            ),
             ("metadata that are announced but missing", vec![picture]),
-            ("an unknown chunk", vec![(b"TEST", b"odd".as_slice()), picture]),
+            (
+                "an unknown chunk",
+                vec![(b"TEST", b"odd".as_slice()), picture],
+            ),
             ("rubbish", vec![picture, (b"EXIF", &[0xff; 77])]),
         ] {
             let chunks = [vec![(b"VP8X", all.as_slice())], chunks].concat();
             let file = webp(&chunks);
             assert_is_picture(&file, &expected, name);
-            assert_is_picture(&[&file, b"more".as_slice()].concat(), &expected, "bytes behind");
+            assert_is_picture(
+                &[&file, b"more".as_slice()].concat(),
+                &expected,
+                "bytes behind",
+            );
         }
         let rubbish = (b"ALPH", [0x01, 0xff, 0xff].as_slice());
         let file = webp(&[(b"VP8X", &extended(0x10, 48, 32)), rubbish, picture]);
@@ -208,18 +248,33 @@ fn a_webp_whose_picture_is_incomplete_is_refused() {
         let file = webp(&[(&kind, &data)]);
         let mut short = file.clone();
         short[4] -= 4;
-        assert_eq!(code(&short), "image_undecodable", "a length that is too short");
+        assert_eq!(
+            code(&short),
+            "image_undecodable",
+            "a length that is too short"
+        );
         // Every length agrees with what is left.
         for kept in [0, 5, 10, data.len() / 4, data.len() / 2] {
             let half = webp(&[(&kind, &data[..kept])]);
-            assert_eq!(code(&half), "image_undecodable", "{kept} bytes of the picture");
+            assert_eq!(
+                code(&half),
+                "image_undecodable",
+                "{kept} bytes of the picture"
+            );
         }
         let other = webp(&[(b"VP8X", &extended(0, 40, 32)), (&kind, &data)]);
-        assert_eq!(code(&other), "image_undecodable", "a canvas of another size");
+        assert_eq!(
+            code(&other),
+            "image_undecodable",
+            "a canvas of another size"
+        );
         let huge = [0, 0, 0, 0, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff];
         let huge = webp(&[(b"VP8X", &huge), (&kind, &data)]);
         assert_eq!(code(&huge), "image_too_large");
-        assert_eq!(code(&webp(&[(b"VP8X", &extended(0, 48, 32))])), "image_undecodable");
+        assert_eq!(
+            code(&webp(&[(b"VP8X", &extended(0, 48, 32))])),
+            "image_undecodable"
+        );
     }
     let animated = fixture("animated.webp");
     assert_eq!(code(&animated[..animated.len() / 2]), "image_undecodable");

@@ -44,7 +44,10 @@ pub(super) fn decode(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, Ima
     let mut pixels = vec![0; bytes as usize];
     decoder.read_image(&mut pixels).map_err(error)?;
     if has_alpha {
-        pixels = pixels.chunks_exact(4).flat_map(|rgba| [rgba[0], rgba[1], rgba[2]]).collect();
+        pixels = pixels
+            .chunks_exact(4)
+            .flat_map(|rgba| [rgba[0], rgba[1], rgba[2]])
+            .collect();
     }
     Ok(RgbImage { size, pixels })
 }

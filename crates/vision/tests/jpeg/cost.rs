@@ -26,9 +26,17 @@ fn bomb(side: u16, scans: &[Scan]) -> Vec<u8> {
     let blocks = u32::from(side).div_ceil(8).pow(2);
     for scan in scans {
         let mut header = vec![scan.components.len() as u8];
-        header.extend(scan.components.iter().flat_map(|&component| [component as u8 + 1, 0]));
+        header.extend(
+            scan.components
+                .iter()
+                .flat_map(|&component| [component as u8 + 1, 0]),
+        );
         let (high, low) = scan.bits;
-        header.extend([scan.band.0 as u8, scan.band.1 as u8, (high << 4 | low) as u8]);
+        header.extend([
+            scan.band.0 as u8,
+            scan.band.1 as u8,
+            (high << 4 | low) as u8,
+        ]);
         file.extend(segment(0xda, &header));
         let mut bits = Bits::default();
         if scan.band.0 == 0 {
@@ -103,14 +111,20 @@ fn the_limit_is_a_setting_and_counts_samples() {
         };
         decode(&file, &limited(samples)).unwrap();
         let refused = decode(&file, &limited(samples - 1)).unwrap_err();
-        assert!(matches!(refused, ImageError::TooManyScans { .. }), "{refused}");
+        assert!(
+            matches!(refused, ImageError::TooManyScans { .. }),
+            "{refused}"
+        );
     }
 }
 
 #[test]
 fn more_than_a_hundred_scans_are_refused_however_small() {
     let refused = decode(&bomb(8, &lawful(101)), &ImageConfig::default()).unwrap_err();
-    assert!(refused.to_string().contains("more than 100 scans"), "{refused}");
+    assert!(
+        refused.to_string().contains("more than 100 scans"),
+        "{refused}"
+    );
     // Scans that a complete picture does not need count, too.
     let layout = Layout::new(64, 64, Colours::YCbCr);
     let scan = layout.scans().concat();
@@ -120,7 +134,10 @@ fn more_than_a_hundred_scans_are_refused_however_small() {
     };
     decode(&file(100), &ImageConfig::default()).unwrap();
     let refused = decode(&file(101), &ImageConfig::default()).unwrap_err();
-    assert!(refused.to_string().contains("more than 100 scans"), "{refused}");
+    assert!(
+        refused.to_string().contains("more than 100 scans"),
+        "{refused}"
+    );
 }
 
 /// Megabytes of tables and metadata that no scan uses are passed over.
@@ -128,13 +145,25 @@ fn more_than_a_hundred_scans_are_refused_however_small() {
 fn tables_and_metadata_that_nothing_uses_cost_nothing() {
     let layout = Layout::new(64, 64, Colours::YCbCr);
     let [dc, ac] = crate::encoder::huffman_tables();
-    let profile = segment(0xe2, &[b"ICC_PROFILE\0\x01\x01".as_slice(), &[7; 60_000]].concat());
+    let profile = segment(
+        0xe2,
+        &[b"ICC_PROFILE\0\x01\x01".as_slice(), &[7; 60_000]].concat(),
+    );
     let quantisers = segment(0xdb, &[&[0][..], &[3; 64]].concat());
     let expected = decode(&layout.encode(), &ImageConfig::default()).unwrap();
-    for extra in [ac.repeat(20_000), dc.repeat(200_000), profile.repeat(200), quantisers.repeat(80_000)] {
+    for extra in [
+        ac.repeat(20_000),
+        dc.repeat(200_000),
+        profile.repeat(200),
+        quantisers.repeat(80_000),
+    ] {
         let file = layout.encode();
         let file = [&file[..2], &extra, &file[2..]].concat();
-        assert!(file.len() > 4 << 20 && file.len() < 20 << 20, "{} bytes", file.len());
+        assert!(
+            file.len() > 4 << 20 && file.len() < 20 << 20,
+            "{} bytes",
+            file.len()
+        );
         assert!(decode(&file, &ImageConfig::default()).unwrap() == expected);
     }
 }

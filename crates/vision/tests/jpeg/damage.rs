@@ -31,7 +31,11 @@ fn every_cut_with_and_without_an_end_marker() {
         }
         let half = &file[..file.len() * 3 / 4];
         assert_refused(half, "truncated", "half");
-        assert_refused(&[half, b"\xff\xd9"].concat(), "truncated", "half with an end");
+        assert_refused(
+            &[half, b"\xff\xd9"].concat(),
+            "truncated",
+            "half with an end",
+        );
     }
 }
 
@@ -82,11 +86,18 @@ fn missing_scans() {
         ..Layout::new(70, 50, Colours::YCbCr)
     };
     let means = Scan::new(&[0, 1], (0, 0), (0, 0));
-    assert_refused(&progressive(vec![means.clone()]).encode(), "component 3", "no red");
+    assert_refused(
+        &progressive(vec![means.clone()]).encode(),
+        "component 3",
+        "no red",
+    );
     let all = Scan::new(&[0, 1, 2], (0, 0), (0, 0));
     for (name, scan) in [
         ("means again", all.clone()),
-        ("a refinement of what is final", Scan::new(&[0], (0, 0), (1, 0))),
+        (
+            "a refinement of what is final",
+            Scan::new(&[0], (0, 0), (1, 0)),
+        ),
         ("a refinement of nothing", Scan::new(&[0], (1, 63), (2, 1))),
     ] {
         let file = progressive(vec![all.clone(), scan]).encode();
@@ -94,7 +105,10 @@ fn missing_scans() {
     }
     for (name, scan) in [
         ("means and others", Scan::new(&[0], (0, 5), (0, 0))),
-        ("a band of two components", Scan::new(&[0, 1], (1, 5), (0, 0))),
+        (
+            "a band of two components",
+            Scan::new(&[0, 1], (1, 5), (0, 0)),
+        ),
         ("two bits at once", Scan::new(&[0], (1, 5), (3, 1))),
     ] {
         let file = progressive(vec![all.clone(), scan]).encode();
@@ -108,10 +122,17 @@ fn missing_scans() {
 fn a_header_without_image_data() {
     let huge = Layout::new(8, 8, Colours::YCbCr);
     let mut file = [b"\xff\xd8".as_slice(), &huge.head().concat()].concat();
-    let frame = file.windows(2).position(|marker| marker == [0xff, 0xc0]).unwrap();
+    let frame = file
+        .windows(2)
+        .position(|marker| marker == [0xff, 0xc0])
+        .unwrap();
     file[frame + 5..frame + 9].copy_from_slice(&[0x1f, 0x40, 0x1f, 0x40]);
     assert_refused(&file, "truncated", "64 megapixels without a scan");
-    assert_refused(&[&file[..], b"\xff\xd9"].concat(), "truncated", "with an end marker");
+    assert_refused(
+        &[&file[..], b"\xff\xd9"].concat(),
+        "truncated",
+        "with an end marker",
+    );
     let scan = segment(0xda, &[3, 1, 0, 2, 0, 3, 0, 0, 63, 0]);
     let file = [file, scan, b"\xff\xd9".to_vec()].concat();
     assert_refused(&file, "has 0 of 1000000 units", "with an empty scan");
@@ -122,7 +143,13 @@ fn with_frame(change: impl Fn(&mut Vec<u8>)) -> Vec<u8> {
     let layout = Layout::new(70, 50, Colours::YCbCr);
     let mut segments = layout.head();
     change(&mut segments[2]);
-    [b"\xff\xd8".to_vec(), segments.concat(), layout.scans().concat(), b"\xff\xd9".to_vec()].concat()
+    [
+        b"\xff\xd8".to_vec(),
+        segments.concat(),
+        layout.scans().concat(),
+        b"\xff\xd9".to_vec(),
+    ]
+    .concat()
 }
 
 #[test]
@@ -143,12 +170,36 @@ fn codings_that_are_not_supported() {
     }
     assert!(full(&coded(0xc1)).is_ok(), "extended sequential");
     assert_refused(&with_frame(|frame| frame[4] = 12), "12 bits", "depth");
-    assert_refused(&with_frame(|frame| frame[5..7].fill(0)), "DNL", "height zero");
-    assert_refused(&with_frame(|frame| frame[7..9].fill(0)), "0x50", "width zero");
-    assert_refused(&with_frame(|frame| frame[11] = 0x01), "sampling", "factor zero");
-    assert_refused(&with_frame(|frame| frame[11] = 0x15), "sampling", "factor five");
-    assert_refused(&with_frame(|frame| frame[12] = 4), "slot", "slot of quantisers");
-    assert_refused(&with_frame(|frame| frame[12] = 3), "quantisers", "empty slot");
+    assert_refused(
+        &with_frame(|frame| frame[5..7].fill(0)),
+        "DNL",
+        "height zero",
+    );
+    assert_refused(
+        &with_frame(|frame| frame[7..9].fill(0)),
+        "0x50",
+        "width zero",
+    );
+    assert_refused(
+        &with_frame(|frame| frame[11] = 0x01),
+        "sampling",
+        "factor zero",
+    );
+    assert_refused(
+        &with_frame(|frame| frame[11] = 0x15),
+        "sampling",
+        "factor five",
+    );
+    assert_refused(
+        &with_frame(|frame| frame[12] = 4),
+        "slot",
+        "slot of quantisers",
+    );
+    assert_refused(
+        &with_frame(|frame| frame[12] = 3),
+        "quantisers",
+        "empty slot",
+    );
     for count in [0, 2, 5] {
         let frame = with_frame(|frame| {
             let components = frame.split_off(10);
@@ -172,28 +223,73 @@ fn segments_that_are_wrong() {
     full_code.extend([0; 4]);
     full_code[3] += 4;
     for (name, extra, cause) in [
-        ("length zero", vec![0xff, 0xe4, 0, 0], "wrong length"),
-        ("length one", vec![0xff, 0xfe, 0, 1], "wrong length"),
+        (
+            "tables of length zero",
+            vec![0xff, 0xc4, 0, 0],
+            "wrong length",
+        ),
+        (
+            "quantisers of length one",
+            vec![0xff, 0xdb, 0, 1],
+            "wrong length",
+        ),
         ("a second frame", head[2].clone(), "second frame header"),
         ("a second start", vec![0xff, 0xd8], "second start of image"),
         ("an unknown marker", vec![0xff, 0x02], "FF 02"),
-        ("a table of a wrong class", segment(0xc4, &[[0x20].as_slice(), &[0; 16]].concat()), "kind or slot"),
-        ("a table in a wrong slot", segment(0xc4, &[[0x04].as_slice(), &[0; 16]].concat()), "slot"),
+        (
+            "a table of a wrong class",
+            segment(0xc4, &[[0x20].as_slice(), &[0; 16]].concat()),
+            "kind or slot",
+        ),
+        (
+            "a table in a wrong slot",
+            segment(0xc4, &[[0x04].as_slice(), &[0; 16]].concat()),
+            "slot",
+        ),
         ("half a table", segment(0xc4, &dc[4..20]), "wrong length"),
-        ("a table with a code of ones", full_code, "Huffman table is corrupt"),
+        (
+            "a table with a code of ones",
+            full_code,
+            "Huffman table is corrupt",
+        ),
         ("half quantisers", segment(0xdb, &[0; 40]), "wrong length"),
-        ("quantisers in a wrong slot", segment(0xdb, &[4; 65]), "slot"),
-        ("half a restart interval", segment(0xdd, &[1]), "wrong length"),
-        ("a scan of no component", segment(0xda, &[0, 0, 63, 0]), "wrong parameters"),
-        ("a scan of an unknown one", segment(0xda, &[1, 9, 0, 0, 63, 0]), "wrong parameters"),
-        ("a scan with a wrong table", segment(0xda, &[1, 1, 0x40, 0, 63, 0]), "wrong parameters"),
+        (
+            "quantisers in a wrong slot",
+            segment(0xdb, &[4; 65]),
+            "slot",
+        ),
+        (
+            "half a restart interval",
+            segment(0xdd, &[1]),
+            "wrong length",
+        ),
+        (
+            "a scan of no component",
+            segment(0xda, &[0, 0, 63, 0]),
+            "wrong parameters",
+        ),
+        (
+            "a scan of an unknown one",
+            segment(0xda, &[1, 9, 0, 0, 63, 0]),
+            "wrong parameters",
+        ),
+        (
+            "a scan with a wrong table",
+            segment(0xda, &[1, 1, 0x40, 0, 63, 0]),
+            "wrong parameters",
+        ),
     ] {
         let file = [b"\xff\xd8", &head.concat()[..], &extra, &scans, b"\xff\xd9"].concat();
         assert_refused(&file, cause, name);
     }
     let early = [b"\xff\xd8", &scans[..], &head.concat(), b"\xff\xd9"].concat();
     assert_refused(&early, "before the frame header", "a scan first");
-    let unquantised: Vec<u8> = head.iter().filter(|part| part[1] != 0xdb).flatten().copied().collect();
+    let unquantised: Vec<u8> = head
+        .iter()
+        .filter(|part| part[1] != 0xdb)
+        .flatten()
+        .copied()
+        .collect();
     let file = [b"\xff\xd8", &unquantised[..], &scans, b"\xff\xd9"].concat();
     assert_refused(&file, "quantisers", "no quantisers");
 }
@@ -206,13 +302,32 @@ fn a_huffman_table_that_is_missing() {
     for slots in [0x20, 0x03] {
         scan[6] = slots;
         let file = [b"\xff\xd8", &layout.head().concat()[..], &scan, b"\xff\xd9"].concat();
-        assert_refused(&file, "Huffman table that is missing", "a slot without a table");
+        assert_refused(
+            &file,
+            "Huffman table that is missing",
+            "a slot without a table",
+        );
     }
     // Motion JPEG is sequential, so progressive pictures have no standard tables.
     let layout = Layout::new(70, 50, Colours::YCbCr).progressive();
-    let head: Vec<u8> = layout.head().into_iter().filter(|part| part[1] != 0xc4).flatten().collect();
-    let file = [b"\xff\xd8", &head[..], &layout.scans().concat(), b"\xff\xd9"].concat();
-    assert_refused(&file, "Huffman table that is missing", "a progressive picture without tables");
+    let head: Vec<u8> = layout
+        .head()
+        .into_iter()
+        .filter(|part| part[1] != 0xc4)
+        .flatten()
+        .collect();
+    let file = [
+        b"\xff\xd8",
+        &head[..],
+        &layout.scans().concat(),
+        b"\xff\xd9",
+    ]
+    .concat();
+    assert_refused(
+        &file,
+        "Huffman table that is missing",
+        "a progressive picture without tables",
+    );
 }
 
 #[test]
@@ -221,12 +336,26 @@ fn codes_without_meaning() {
     let head = |layout: &Layout| [b"\xff\xd8".to_vec(), layout.head().concat()].concat();
     let layout = Layout::new(8, 8, Colours::Grey);
     let scan = |data: &[u8]| {
-        [&head(&layout), &segment(0xda, &[1, 1, 0, 0, 63, 0]), data, b"\xff\xd9"].concat()
+        [
+            &head(&layout),
+            &segment(0xda, &[1, 1, 0, 0, 63, 0]),
+            data,
+            b"\xff\xd9",
+        ]
+        .concat()
     };
     assert!(full(&scan(&[0x00, 0x0f])).is_ok(), "a grey block");
     for (name, data, cause) in [
-        ("no such code", &[0xdf, 0xff, 0x00, 0x00][..], "no table has"),
-        ("out of the block", &[0x0f, 0x0f, 0x0f, 0x0f, 0x0f, 0x1f], "outside its block"),
+        (
+            "no such code",
+            &[0xdf, 0xff, 0x00, 0x00][..],
+            "no table has",
+        ),
+        (
+            "out of the block",
+            &[0x0f, 0x0f, 0x0f, 0x0f, 0x0f, 0x1f],
+            "outside its block",
+        ),
         ("an end of blocks", &[0x01, 0x0f, 0x00], "without meaning"),
     ] {
         assert_refused(&scan(data), cause, name);

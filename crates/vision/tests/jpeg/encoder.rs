@@ -48,7 +48,9 @@ pub fn interleaved(components: usize) -> Vec<Scan> {
 
 /// One scan for each component.
 pub fn separate(components: usize) -> Vec<Scan> {
-    (0..components).map(|component| Scan::new(&[component], (0, 63), (0, 0))).collect()
+    (0..components)
+        .map(|component| Scan::new(&[component], (0, 63), (0, 0)))
+        .collect()
 }
 
 /// The scans of libjpeg's progressive mode: means first, then bands, then the last bit.
@@ -61,7 +63,10 @@ pub fn progressive(components: usize) -> Vec<Scan> {
         scans.push(Scan::new(&[component], (1, 63), (2, 1)));
     }
     scans.push(Scan::new(&all, (0, 0), (1, 0)));
-    scans.extend(all.iter().map(|&component| Scan::new(&[component], (1, 63), (1, 0))));
+    scans.extend(
+        all.iter()
+            .map(|&component| Scan::new(&[component], (1, 63), (1, 0))),
+    );
     scans
 }
 
@@ -108,8 +113,18 @@ impl Layout {
     }
 
     pub fn largest(&self) -> (u32, u32) {
-        let horizontal = self.sampling.iter().map(|sampling| sampling.0).max().unwrap();
-        let vertical = self.sampling.iter().map(|sampling| sampling.1).max().unwrap();
+        let horizontal = self
+            .sampling
+            .iter()
+            .map(|sampling| sampling.0)
+            .max()
+            .unwrap();
+        let vertical = self
+            .sampling
+            .iter()
+            .map(|sampling| sampling.1)
+            .max()
+            .unwrap();
         (horizontal, vertical)
     }
 
@@ -117,7 +132,10 @@ impl Layout {
     fn units(&self) -> (u32, u32) {
         let (horizontal, vertical) = self.largest();
         let ImageSize { width, height } = self.size;
-        (width.div_ceil(8 * horizontal), height.div_ceil(8 * vertical))
+        (
+            width.div_ceil(8 * horizontal),
+            height.div_ceil(8 * vertical),
+        )
     }
 
     /// Blocks with samples of the picture, across and down.
@@ -126,7 +144,10 @@ impl Layout {
         let ImageSize { width, height } = self.size;
         let (own_horizontal, own_vertical) = self.sampling[component];
         let blocks = |side: u32, own: u32, all: u32| (side * own).div_ceil(all).div_ceil(8);
-        (blocks(width, own_horizontal, horizontal), blocks(height, own_vertical, vertical))
+        (
+            blocks(width, own_horizontal, horizontal),
+            blocks(height, own_vertical, vertical),
+        )
     }
 
     /// The segments before the first scan.
@@ -170,7 +191,10 @@ impl Layout {
     pub fn scans(&self) -> Vec<Vec<u8>> {
         let components = 0..self.sampling.len();
         let planes: Vec<Plane> = components.map(|component| self.plane(component)).collect();
-        self.scans.iter().map(|scan| self.scan(scan, &planes)).collect()
+        self.scans
+            .iter()
+            .map(|scan| self.scan(scan, &planes))
+            .collect()
     }
 
     fn scan(&self, scan: &Scan, planes: &[Plane]) -> Vec<u8> {
@@ -179,7 +203,11 @@ impl Layout {
             body.extend([component as u8 + 1, 0]);
         }
         let (high, low) = scan.bits;
-        body.extend([scan.band.0 as u8, scan.band.1 as u8, (high << 4 | low) as u8]);
+        body.extend([
+            scan.band.0 as u8,
+            scan.band.1 as u8,
+            (high << 4 | low) as u8,
+        ]);
         let mut bytes = segment(0xda, &body);
         let units = self.unit_blocks(scan);
         let interval = match self.restart_interval {
@@ -254,10 +282,13 @@ const QUANTISER: u8 = 3;
 /// The discrete cosine transform by its formula, quantised, in zigzag order.
 fn coefficients(samples: &[f32; 64]) -> [i32; 64] {
     let scale = |frequency: usize| if frequency == 0 { 0.5f32.sqrt() } else { 1.0 };
-    let wave = |at: usize, frequency: usize| ((2 * at + 1) as f32 * frequency as f32 * PI / 16.0).cos();
+    let wave =
+        |at: usize, frequency: usize| ((2 * at + 1) as f32 * frequency as f32 * PI / 16.0).cos();
     zigzag().map(|(u, v)| {
         let terms = samples.iter().enumerate();
-        let sum: f32 = terms.map(|(i, value)| value * wave(i % 8, u) * wave(i / 8, v)).sum();
+        let sum: f32 = terms
+            .map(|(i, value)| value * wave(i % 8, u) * wave(i / 8, v))
+            .sum();
         (sum * scale(u) * scale(v) / 4.0 / f32::from(QUANTISER)).round() as i32
     })
 }
@@ -276,7 +307,10 @@ fn encode_interval(
     units: &[Vec<(usize, usize)>],
     planes: &[Plane],
 ) -> Vec<u8> {
-    let blocks = units.iter().flatten().map(|&(component, at)| (component, &planes[component][at]));
+    let blocks = units
+        .iter()
+        .flatten()
+        .map(|&(component, at)| (component, &planes[component][at]));
     if scan.band.0 > 0 && scan.bits.0 > 0 {
         return Refinement::encode(scan, blocks.map(|(_, block)| block));
     }
@@ -296,8 +330,15 @@ fn encode_interval(
         let first = scan.band.0.max(1);
         if high == 0 && first <= scan.band.1 {
             // A point transform cuts off bits towards zero.
-            let band = block[first..=scan.band.1].iter().map(|value| value / (1 << low));
-            first_ac(&mut bits, &band.collect::<Vec<_>>(), &mut run, is_progressive);
+            let band = block[first..=scan.band.1]
+                .iter()
+                .map(|value| value / (1 << low));
+            first_ac(
+                &mut bits,
+                &band.collect::<Vec<_>>(),
+                &mut run,
+                is_progressive,
+            );
         }
     }
     end_run(&mut bits, &mut run);

@@ -91,7 +91,11 @@ fn pictures_of_red_green_and_blue_and_of_inks() {
 #[test]
 fn pictures_of_one_row_or_column() {
     for (width, height) in [(1, 1), (1, 90), (90, 1), (8, 8), (3, 9)] {
-        for sampling in [[(1, 1); 3], [(2, 2), (1, 1), (1, 1)], [(2, 1), (1, 1), (1, 1)]] {
+        for sampling in [
+            [(1, 1); 3],
+            [(2, 2), (1, 1), (1, 1)],
+            [(2, 1), (1, 1), (1, 1)],
+        ] {
             let layout = Layout::new(width, height, Colours::YCbCr).sampled(&sampling);
             for (coding, layout) in every_coding(&layout) {
                 let image = full(&layout.encode()).unwrap_or_else(|error| {
@@ -142,7 +146,11 @@ fn every_split_of_bands_and_bits() {
         .chain(each((1, 63), (1, 0)))
         .collect();
     let means_alone: Vec<Scan> = each((0, 0), (0, 0)).chain(each((1, 63), (0, 0))).collect();
-    for (name, scans) in [("deep", deep), ("refined", refined), ("means alone", means_alone)] {
+    for (name, scans) in [
+        ("deep", deep),
+        ("refined", refined),
+        ("means alone", means_alone),
+    ] {
         for sampling in [[(1, 1); 3], [(2, 2), (1, 1), (1, 1)]] {
             for interval in [0, 2] {
                 let layout = Layout {
@@ -197,9 +205,16 @@ fn noise_through_the_longest_codes() {
         let [r, g, b] = [0, 1, 2].map(|i| f32::from(rgb[i]));
         0.299 * r + 0.587 * g + 0.114 * b
     };
-    let pairs = best.pixels.chunks_exact(3).zip(noise.pixels.chunks_exact(3));
+    let pairs = best
+        .pixels
+        .chunks_exact(3)
+        .zip(noise.pixels.chunks_exact(3));
     let off: f32 = pairs.map(|(a, b)| (luma(a) - luma(b)).abs()).sum();
-    assert!(off / (123.0 * 77.0) < 12.0, "off by {} on average", off / (123.0 * 77.0));
+    assert!(
+        off / (123.0 * 77.0) < 12.0,
+        "off by {} on average",
+        off / (123.0 * 77.0)
+    );
 }
 
 #[test]
@@ -211,8 +226,16 @@ fn separate_scans_may_stand_for_one_component_each_only_once() {
     // The picture is complete after three scans; viewers ignore the fourth.
     assert_shows(&twice.encode(), &twice, "a scan too many");
     let instead = Layout {
-        scans: vec![separate(3)[0].clone(), separate(3)[0].clone(), separate(3)[1].clone()],
+        scans: vec![
+            separate(3)[0].clone(),
+            separate(3)[0].clone(),
+            separate(3)[1].clone(),
+        ],
         ..Layout::new(70, 50, Colours::YCbCr)
     };
-    assert_refused(&instead.encode(), "does not continue", "luma twice instead of a colour");
+    assert_refused(
+        &instead.encode(),
+        "does not continue",
+        "luma twice instead of a colour",
+    );
 }

@@ -41,8 +41,12 @@ fn colour(colours: Colours, u: f32, v: f32) -> [f32; 3] {
     let at = |place| value(place, u, v);
     let from_luma = || {
         let (y, cb, cr) = (at(0), at(1) - 128.0, at(2) - 128.0);
-        [y + 1.402 * cr, y - 0.344_14 * cb - 0.714_14 * cr, y + 1.772 * cb]
-            .map(|level| level.clamp(0.0, 255.0))
+        [
+            y + 1.402 * cr,
+            y - 0.344_14 * cb - 0.714_14 * cr,
+            y + 1.772 * cb,
+        ]
+        .map(|level| level.clamp(0.0, 255.0))
     };
     match colours {
         Colours::Grey => [at(0); 3],
@@ -106,7 +110,10 @@ pub fn assert_agrees(bytes: &[u8], image: &RgbImage, name: &str) {
         let deviation = placeformer_vision::image::DEVIATION[channel];
         let level = (value * deviation + mean) * 255.0;
         let off = (level - f32::from(small.pixels[3 * pixel + channel])).abs();
-        assert!(off < 14.0, "{name}: reduced, channel {channel} is off by {off}");
+        assert!(
+            off < 14.0,
+            "{name}: reduced, channel {channel} is off by {off}"
+        );
     }
 }
 
@@ -115,7 +122,11 @@ pub fn assert_agrees(bytes: &[u8], image: &RgbImage, name: &str) {
 pub fn assert_refused(bytes: &[u8], cause: &str, name: &str) {
     for refused in [full(bytes).map(drop), reduced(bytes).map(drop)] {
         let error = refused.err().unwrap_or_else(|| panic!("{name} was taken"));
-        assert_eq!(error.code().as_str(), "image_undecodable", "{name}: {error}");
+        assert_eq!(
+            error.code().as_str(),
+            "image_undecodable",
+            "{name}: {error}"
+        );
         assert!(error.to_string().contains(cause), "{name}: {error}");
     }
 }
@@ -124,6 +135,12 @@ pub fn assert_refused(bytes: &[u8], cause: &str, name: &str) {
 #[track_caller]
 pub fn is_taken(bytes: &[u8], name: &str) -> bool {
     let (whole, small) = (full(bytes), reduced(bytes));
-    assert_eq!(whole.is_ok(), small.is_ok(), "{name}: {:?} {:?}", whole.err(), small.err());
+    assert_eq!(
+        whole.is_ok(),
+        small.is_ok(),
+        "{name}: {:?} {:?}",
+        whole.err(),
+        small.err()
+    );
     whole.is_ok()
 }

@@ -2,8 +2,8 @@
 
 use crate::encoder::{Layout, jfif, segment};
 use crate::picture::{Colours, assert_agrees, assert_shows, full};
-use placeformer_vision::image::{RgbImage, encode_jpeg};
 use placeformer_core::types::ImageSize;
+use placeformer_vision::image::{RgbImage, encode_jpeg};
 
 fn layouts() -> Vec<Layout> {
     let layout = Layout::new(70, 50, Colours::YCbCr).sampled(&[(2, 2), (1, 1), (1, 1)]);
@@ -42,19 +42,36 @@ fn assert_same(file: &[u8], layout: &Layout, name: &str) {
 fn anything_harmless_between_segments() {
     let thumbnail = Layout::new(16, 16, Colours::Grey).encode();
     let exif = [b"Exif\0\0".as_slice(), &thumbnail].concat();
-    let harmless: [(&str, Vec<u8>); 12] = [
+    let harmless: [(&str, Vec<u8>); 14] = [
         ("zeros", vec![0, 0]),
         ("stray bytes", b"stray".to_vec()),
         ("an escaped byte", vec![0xff, 0]),
         ("fill bytes", vec![0xff; 5]),
-        ("a comment with an end marker", segment(0xfe, b"\xff\xd9\xff\xd8\xff\xda")),
+        (
+            "a comment with an end marker",
+            segment(0xfe, b"\xff\xd9\xff\xd8\xff\xda"),
+        ),
         ("an empty comment", segment(0xfe, b"")),
         ("a thumbnail", segment(0xe1, &exif)),
         ("a second JFIF header", jfif()),
-        ("a colour profile", segment(0xe2, &[b"ICC_PROFILE\0\x01\x02".as_slice(), &[0xff; 90]].concat())),
+        (
+            "a colour profile",
+            segment(
+                0xe2,
+                &[b"ICC_PROFILE\0\x01\x02".as_slice(), &[0xff; 90]].concat(),
+            ),
+        ),
+        ("metadata of length zero", vec![0xff, 0xe4, 0, 0]),
+        ("a comment of length one", vec![0xff, 0xfe, 0, 1]),
         ("a restart marker", vec![0xff, 0xd3]),
         ("a marker without content", vec![0xff, 0x01]),
-        ("a Huffman table that nothing uses", segment(0xc4, &[&[0x13][..], &[255; 1], &[0; 15], &[1; 255]].concat())),
+        (
+            "a Huffman table that nothing uses",
+            segment(
+                0xc4,
+                &[&[0x13][..], &[255; 1], &[0; 15], &[1; 255]].concat(),
+            ),
+        ),
     ];
     for layout in layouts() {
         for (name, extra) in &harmless {
@@ -106,7 +123,12 @@ fn stray_bytes_before_restart_markers() {
     for layout in layouts() {
         let file = layout.encode();
         for at in restarts(&file).into_iter().take(20) {
-            for stray in [b"\x11".as_slice(), &[0x5a; 9], &[0xff, 0x00, 0xff, 0x00], &[0xff, 0xff]] {
+            for stray in [
+                b"\x11".as_slice(),
+                &[0x5a; 9],
+                &[0xff, 0x00, 0xff, 0x00],
+                &[0xff, 0xff],
+            ] {
                 let file = [&file[..at], stray, &file[at..]].concat();
                 assert_same(&file, &layout, "stray bytes");
             }
@@ -116,7 +138,10 @@ fn stray_bytes_before_restart_markers() {
 
 #[test]
 fn restart_markers_of_a_number_far_off() {
-    for layout in layouts().into_iter().filter(|layout| layout.restart_interval > 0) {
+    for layout in layouts()
+        .into_iter()
+        .filter(|layout| layout.restart_interval > 0)
+    {
         for off in [3, 4, 5] {
             let mut file = layout.encode();
             let at = restarts(&file)[0];
@@ -153,7 +178,10 @@ fn a_frame_without_huffman_tables() {
 #[test]
 fn quantisers_of_sixteen_bits_and_of_zero() {
     let wide = |value: u16| {
-        let values = [value; 64].iter().flat_map(|value| value.to_be_bytes()).collect::<Vec<_>>();
+        let values = [value; 64]
+            .iter()
+            .flat_map(|value| value.to_be_bytes())
+            .collect::<Vec<_>>();
         segment(0xdb, &[&[0x10][..], &values].concat())
     };
     for layout in layouts() {
@@ -166,9 +194,10 @@ fn quantisers_of_sixteen_bits_and_of_zero() {
     let mut table = [3; 64];
     table[60..].fill(0);
     let table = segment(0xdb, &[&[0][..], &table].concat());
-    for layout in layouts().into_iter().filter(|layout| {
-        layout.progressive || layout.scans.len() == 1
-    }) {
+    for layout in layouts()
+        .into_iter()
+        .filter(|layout| layout.progressive || layout.scans.len() == 1)
+    {
         let file = with_segment(&layout, 2, &table);
         assert_shows(&file, &layout, "quantisers of zero");
     }

@@ -13,6 +13,9 @@ use super::huffman::{Bits, HuffmanTable};
 const MAX_UNIT_BLOCKS: u32 = 10;
 /// Most bits of a DC difference of 8-bit samples.
 const MAX_DC_BITS: u8 = 11;
+/// Most bits of another coefficient, with those that later scans add. Honest ones have 10; with more
+/// than 15 the sums of some decoders overflow.
+const MAX_AC_BITS: u32 = 15;
 
 /// For each block of a component a bit for each coefficient that is not zero; empty if no scan
 /// refines the component, because only then it is needed.
@@ -98,6 +101,7 @@ struct ScanDecoder<'a> {
     is_dc: bool,
     is_refinement: bool,
     band: (usize, usize),
+    low: u32,
     /// For each component of the scan.
     tables: Vec<BlockTables<'a>>,
     /// For each block of a unit the component, as place in `tables`.
@@ -138,6 +142,7 @@ impl<'a> ScanDecoder<'a> {
             is_dc: scan.is_dc(),
             is_refinement: scan.is_refinement(),
             band: scan.band,
+            low: u32::from(scan.low),
             tables: tables.collect::<Result<_, _>>()?,
             unit,
             non_zero: &mut non_zero[scan.parts[0].component],
@@ -202,6 +207,9 @@ impl<'a> ScanDecoder<'a> {
                 k += run as usize;
                 if k > last {
                     return Err(Fault::Overrun);
+                }
+                if size + self.low > MAX_AC_BITS {
+                    return Err(Fault::BadSymbol);
                 }
                 if size > 0 {
                     bits.skip(size)?;

@@ -80,7 +80,7 @@ fn fast(clean: &[u8], size: ImageSize) -> Result<RgbImage, ImageError> {
         .set_strict_mode(true)
         .set_max_width(usize::from(u16::MAX))
         .set_max_height(usize::from(u16::MAX))
-        .jpeg_set_max_scans(super::MAX_SCANS)
+        .jpeg_set_max_scans(super::MAX_SCANS + 1)
         .jpeg_set_out_colorspace(ColorSpace::RGB);
     let mut decoder = zune_jpeg::JpegDecoder::new_with_options(ZCursor::new(clean), options);
     let pixels = decoder.decode();

@@ -144,6 +144,15 @@ impl<'a> Reader<'a> {
         Ok(body)
     }
 
+    /// The same for segments that are skipped: libjpeg takes a length that is too short for zero.
+    fn metadata(&mut self) -> Result<&'a [u8], Fault> {
+        if let Some([0, 0 | 1]) = self.bytes.get(self.at..self.at + 2) {
+            self.at += 2;
+            return Ok(&[]);
+        }
+        self.body("metadata")
+    }
+
     fn segment(&mut self, marker: u8) -> Result<(), Fault> {
         match marker {
             marker::TEM | marker::FIRST_RST..=marker::LAST_RST => Ok(()),
@@ -153,14 +162,14 @@ impl<'a> Reader<'a> {
             marker::DRI => self.restart_interval(),
             marker::SOS => self.scan(),
             marker::APP0..=marker::APP15 => self.application_data(marker),
-            marker::COM | marker::DNL | marker::DAC => self.body("comment").map(drop),
+            marker::COM | marker::DNL | marker::DAC => self.metadata().map(drop),
             0xc0..=0xcf => self.frame_header(marker),
             _ => Err(Fault::UnknownMarker(marker)),
         }
     }
 
     fn application_data(&mut self, marker: u8) -> Result<(), Fault> {
-        let body = self.body("APP")?;
+        let body = self.metadata()?;
         // What comes behind the first scan header no longer says what the colours mean.
         if self.scan_count > 0 {
             return Ok(());
