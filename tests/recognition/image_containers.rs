@@ -28,7 +28,7 @@ fn chunks(png: &[u8]) -> Vec<([u8; 4], Vec<u8>)> {
 
 /// A PNG of chunks.
 fn png(chunks: &[Vec<u8>]) -> Vec<u8> {
-    [b"\x89PNG\r\n\x1a\n", &chunks.concat()[..]].concat()
+    [b"\x89PNG\r\n\x1a\n".as_slice(), &chunks.concat()[..]].concat()
 }
 
 /// The picture's PNG as its header, its pixels (compressed) and its end.
@@ -157,7 +157,12 @@ fn webp(chunks: &[(&[u8; 4], &[u8])]) -> Vec<u8> {
         body.extend_from_slice(data);
         body.extend(vec![0; data.len() % 2]);
     }
-    [b"RIFF", &(body.len() as u32).to_le_bytes()[..], &body].concat()
+    [
+        b"RIFF".as_slice(),
+        &(body.len() as u32).to_le_bytes()[..],
+        &body,
+    ]
+    .concat()
 }
 
 fn extended(flags: u8, width: u8, height: u8) -> [u8; 10] {

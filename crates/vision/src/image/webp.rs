@@ -87,7 +87,7 @@ fn alone(chunk: &[u8]) -> Vec<u8> {
     let length = 4 + chunk.len() + padding.len();
     // The chunk is part of an image whose bytes are limited, so its length fits.
     let length = (length as u32).to_le_bytes();
-    [b"RIFF", &length[..], b"WEBP", chunk, padding].concat()
+    [b"RIFF".as_slice(), &length[..], b"WEBP", chunk, padding].concat()
 }
 
 /// The size in the extended header, if there is one.

@@ -44,7 +44,12 @@ fn a_cut_inside_a_scan_of_a_progressive_picture() {
     let layout = Layout::new(70, 50, Colours::YCbCr).progressive();
     let [head, scans] = [layout.head(), layout.scans()];
     for (number, scan) in scans.iter().enumerate() {
-        let before = [b"\xff\xd8", &head.concat()[..], &scans[..number].concat()].concat();
+        let before = [
+            b"\xff\xd8".as_slice(),
+            &head.concat()[..],
+            &scans[..number].concat(),
+        ]
+        .concat();
         for kept in scan.len() - scan.len() / 4..scan.len() {
             let file = [&before, &scan[..kept], b"\xff\xd9"].concat();
             assert_refused(&file, "truncated", &format!("scan {number} cut at {kept}"));
@@ -279,10 +284,23 @@ fn segments_that_are_wrong() {
             "wrong parameters",
         ),
     ] {
-        let file = [b"\xff\xd8", &head.concat()[..], &extra, &scans, b"\xff\xd9"].concat();
+        let file = [
+            b"\xff\xd8".as_slice(),
+            &head.concat()[..],
+            &extra,
+            &scans,
+            b"\xff\xd9",
+        ]
+        .concat();
         assert_refused(&file, cause, name);
     }
-    let early = [b"\xff\xd8", &scans[..], &head.concat(), b"\xff\xd9"].concat();
+    let early = [
+        b"\xff\xd8".as_slice(),
+        &scans[..],
+        &head.concat(),
+        b"\xff\xd9",
+    ]
+    .concat();
     assert_refused(&early, "before the frame header", "a scan first");
     let unquantised: Vec<u8> = head
         .iter()
@@ -290,7 +308,13 @@ fn segments_that_are_wrong() {
         .flatten()
         .copied()
         .collect();
-    let file = [b"\xff\xd8", &unquantised[..], &scans, b"\xff\xd9"].concat();
+    let file = [
+        b"\xff\xd8".as_slice(),
+        &unquantised[..],
+        &scans,
+        b"\xff\xd9",
+    ]
+    .concat();
     assert_refused(&file, "quantisers", "no quantisers");
 }
 
@@ -301,7 +325,13 @@ fn a_huffman_table_that_is_missing() {
     // Only the first two slots have standard tables.
     for slots in [0x20, 0x03] {
         scan[6] = slots;
-        let file = [b"\xff\xd8", &layout.head().concat()[..], &scan, b"\xff\xd9"].concat();
+        let file = [
+            b"\xff\xd8".as_slice(),
+            &layout.head().concat()[..],
+            &scan,
+            b"\xff\xd9",
+        ]
+        .concat();
         assert_refused(
             &file,
             "Huffman table that is missing",

@@ -6,6 +6,7 @@ use crate::picture::{Colours, value};
 use crate::refinement::Refinement;
 use placeformer_core::types::ImageSize;
 use std::f32::consts::PI;
+use std::sync::LazyLock;
 
 /// How a picture is laid out in the file.
 #[derive(Debug, Clone)]
@@ -279,27 +280,37 @@ pub type Plane = Vec<[i32; 64]>;
 
 const QUANTISER: u8 = 3;
 
+/// For each place and frequency the cosine of the transform.
+static WAVES: LazyLock<[[f32; 8]; 8]> = LazyLock::new(|| {
+    let angle = |at: usize, frequency: usize| ((2 * at + 1) * frequency) as f32 * PI / 16.0;
+    std::array::from_fn(|at| std::array::from_fn(|frequency| angle(at, frequency).cos()))
+});
+
 /// The discrete cosine transform by its formula, quantised, in zigzag order.
 fn coefficients(samples: &[f32; 64]) -> [i32; 64] {
     let scale = |frequency: usize| if frequency == 0 { 0.5f32.sqrt() } else { 1.0 };
-    let wave =
-        |at: usize, frequency: usize| ((2 * at + 1) as f32 * frequency as f32 * PI / 16.0).cos();
-    zigzag().map(|(u, v)| {
-        let terms = samples.iter().enumerate();
-        let sum: f32 = terms
-            .map(|(i, value)| value * wave(i % 8, u) * wave(i / 8, v))
-            .sum();
+    let waves = &*WAVES;
+    ZIGZAG.map(|(u, v)| {
+        let mut sum = 0.0;
+        for (row, down) in samples.chunks_exact(8).zip(waves) {
+            let across: f32 = row
+                .iter()
+                .zip(waves)
+                .map(|(value, wave)| value * wave[u])
+                .sum();
+            sum += across * down[v];
+        }
         (sum * scale(u) * scale(v) / 4.0 / f32::from(QUANTISER)).round() as i32
     })
 }
 
 /// The frequencies, across and down, in the order in which they are stored.
-fn zigzag() -> [(usize, usize); 64] {
+static ZIGZAG: LazyLock<[(usize, usize); 64]> = LazyLock::new(|| {
     let mut order: Vec<(usize, usize)> = (0..64).map(|i| (i % 8, i / 8)).collect();
     // Along the diagonals, upwards and downwards in turn.
     order.sort_by_key(|&(u, v)| (u + v, if (u + v) % 2 == 0 { u } else { v }));
     order.try_into().unwrap()
-}
+});
 
 fn encode_interval(
     scan: &Scan,
@@ -393,7 +404,10 @@ pub fn jfif() -> Vec<u8> {
 }
 
 fn adobe(transform: u8) -> Vec<u8> {
-    segment(0xee, &[b"Adobe\0\x64\0\0\0\0", &[transform][..]].concat())
+    segment(
+        0xee,
+        &[b"Adobe\0\x64\0\0\0\0".as_slice(), &[transform][..]].concat(),
+    )
 }
 
 /// A DC table whose codes are the symbols 0 to 11 in four bits, and an AC table whose codes are the

@@ -3,7 +3,7 @@
 use crate::encoder::{Layout, Scan, progressive, separate};
 use crate::picture::{Colours, assert_agrees, assert_refused, assert_shows, full};
 use placeformer_core::types::ImageSize;
-use placeformer_vision::image::{RgbImage, encode_jpeg};
+use placeformer_vision::image::{DEVIATION, ImageConfig, MEAN, RgbImage, encode_jpeg, load_tensor};
 
 /// Sizes that are whole units, and sizes that are not.
 const SIZES: [(u32, u32); 5] = [(64, 64), (70, 50), (97, 33), (31, 129), (17, 17)];
@@ -63,6 +63,33 @@ fn colour_pictures_of_every_sampling() {
         for sampling in SAMPLINGS {
             let layout = Layout::new(width, height, Colours::YCbCr).sampled(&sampling);
             assert_all_codings_show(&layout);
+        }
+    }
+}
+
+/// In a larger picture a reduction is seen to be exact.
+#[test]
+fn large_pictures_are_reduced_to_the_same_picture() {
+    let target = ImageSize {
+        width: 13,
+        height: 9,
+    };
+    for sampling in SAMPLINGS {
+        let layout = Layout::new(250, 170, Colours::YCbCr).sampled(&sampling);
+        for (coding, layout) in every_coding(&layout) {
+            let file = layout.restarting(5).encode();
+            let whole = full(&file).unwrap().resized(target).unwrap();
+            let tensor = load_tensor(&file, &ImageConfig::default(), target).unwrap();
+            let pixels = (target.width * target.height) as usize;
+            for (at, value) in tensor.data.iter().enumerate() {
+                let (channel, pixel) = (at / pixels, at % pixels);
+                let level = (value * DEVIATION[channel] + MEAN[channel]) * 255.0;
+                let off = (level - f32::from(whole.pixels[3 * pixel + channel])).abs();
+                assert!(
+                    off < 16.0,
+                    "{sampling:?}, {coding}: pixel {pixel} is off by {off}"
+                );
+            }
         }
     }
 }

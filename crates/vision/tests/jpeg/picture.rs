@@ -100,6 +100,9 @@ pub fn assert_shows(bytes: &[u8], layout: &Layout, name: &str) {
 }
 
 /// Checks that the reduced picture looks like the whole one.
+///
+/// A reduced picture is a whole number of pixels, so it goes a little beyond one whose sides are no
+/// multiples of the reduction. In these small pictures that shows.
 #[track_caller]
 pub fn assert_agrees(bytes: &[u8], image: &RgbImage, name: &str) {
     let tensor = reduced(bytes).unwrap_or_else(|error| panic!("{name}, reduced: {error}"));

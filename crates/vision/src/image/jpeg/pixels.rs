@@ -100,15 +100,18 @@ fn any_layout(clean: &[u8], frame: &Frame, scale: u32) -> Result<RgbImage, Image
         Colours::Cmyk => ColorTransform::CMYK,
         Colours::Ycck => ColorTransform::YCCK,
     });
-    // The sides of a JPEG are 16-bit numbers, so the conversion loses nothing.
-    let side = |pixels: u32| pixels.div_ceil(scale) as u16;
-    let (width, height) = (side(frame.size.width), side(frame.size.height));
-    let (width, height) = decoder.scale(width, height).map_err(fail)?;
+    let mut size = frame.size;
+    // For the whole size nothing is asked: of a picture of one column the library takes any scale
+    // to be large enough.
+    if scale > 1 {
+        // The sides of a JPEG are 16-bit numbers, so the conversion loses nothing.
+        let side = |pixels: u32| pixels.div_ceil(scale) as u16;
+        let (width, height) = (side(size.width), side(size.height));
+        let (width, height) = decoder.scale(width, height).map_err(fail)?;
+        size.width = u32::from(width);
+        size.height = u32::from(height);
+    }
     let samples = decoder.decode().map_err(fail)?;
-    let size = ImageSize {
-        width: u32::from(width),
-        height: u32::from(height),
-    };
     let pixels = match frame.colours {
         Colours::YCbCr | Colours::Rgb => samples,
         Colours::Grey => samples.into_iter().flat_map(|grey| [grey; 3]).collect(),
