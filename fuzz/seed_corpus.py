@@ -40,10 +40,165 @@ def scan_bomb(scans):
     return JPEG + JPEG[start:] * (scans - 1) + b"\xff\xd9"
 
 
-def exif_jpeg(orientation):
-    tiff = b"II*\0\x08\0\0\0" + struct.pack("<HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
-    body = b"Exif\0\0" + tiff
-    return JPEG[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + JPEG[2:]
+def segment(marker, body):
+    return b"\xff" + bytes([marker]) + struct.pack(">H", len(body) + 2) + body
+
+
+class Bits:
+    """The bits of a JPEG's compressed data, with a zero behind each byte FF."""
+
+    def __init__(self):
+        self.bits = ""
+
+    def put(self, value, count):
+        self.bits += format(value & ((1 << count) - 1), f"0{count}b") if count else ""
+
+    def value(self, value):
+        """The bits behind a symbol that say which of the values of its size this is."""
+        self.put(value if value >= 0 else value - 1, abs(value).bit_length())
+
+    def finish(self):
+        bits = self.bits + "1" * (-len(self.bits) % 8)
+        return bytes(int(bits[i : i + 8], 2) for i in range(0, len(bits), 8)).replace(b"\xff", b"\xff\0")
+
+
+def jpeg(width, height, sampling, scans, progressive=False, interval=0, tables=True, ids=b"\1\2\3\4"):
+    """A JPEG of blocks with a mean and two more coefficients.
+
+    `scans` holds, for each scan, its components, its band, and the bit known before and after it. The code of a DC
+    symbol is the symbol in four bits, that of an AC symbol in eight.
+    """
+    largest = [max(factors[i] for factors in sampling) for i in (0, 1)]
+    units = [-(-side // (8 * most)) for side, most in zip((width, height), largest)]
+    frame = struct.pack(">BHHB", 8, height, width, len(sampling))
+    frame += b"".join(bytes([ids[i], h << 4 | v, 0]) for i, (h, v) in enumerate(sampling))
+    out = b"\xff\xd8" + segment(0xDB, b"\0" + b"\5" * 64) + segment(0xC2 if progressive else 0xC0, frame)
+    if tables:
+        out += segment(0xC4, b"\x00" + bytes([0] * 3 + [12] + [0] * 12) + bytes(range(12)))
+        out += segment(0xC4, b"\x10" + bytes([0] * 7 + [255] + [0] * 8) + bytes(range(255)))
+    if interval:
+        out += segment(0xDD, struct.pack(">H", interval))
+    for components, (first, last), (high, low) in scans:
+        parts = b"".join(bytes([ids[c], 0]) for c in components)
+        out += segment(0xDA, bytes([len(components)]) + parts + bytes([first, last, high << 4 | low]))
+        blocks = []
+        if len(components) == 1:
+            h, v = sampling[components[0]]
+            across = -(-(-(-width * h // largest[0])) // 8)
+            down = -(-(-(-height * v // largest[1])) // 8)
+            blocks = [[components[0]]] * (across * down)
+        else:
+            unit = [c for c in components for _ in range(sampling[c][0] * sampling[c][1])]
+            blocks = [unit] * (units[0] * units[1])
+        step = interval or len(blocks)
+        for number, start in enumerate(range(0, len(blocks), step)):
+            out += bytes([0xFF, 0xD0 + (number - 1) % 8]) if number else b""
+            bits, means = Bits(), [0] * 4
+            for at, unit in enumerate(blocks[start : start + step], start):
+                for component in unit:
+                    block = {0: (at * 7 + component * 11) % 50 - 25, 1: 9 - at % 19, 8: component - 1}
+                    encode_block(bits, block, component, means, (first, last), (high, low))
+            out += bits.finish()
+    return out + b"\xff\xd9"
+
+
+def encode_block(bits, block, component, means, band, known):
+    (first, last), (high, low) = band, known
+    if first == 0 and high:
+        bits.put(block[0] >> low, 1)
+    elif first == 0:
+        mean = block[0] >> low
+        bits.put(abs(mean - means[component]).bit_length(), 4)
+        bits.value(mean - means[component])
+        means[component] = mean
+    if last == 0:
+        return
+    zeros, corrections = 0, []
+    for k in range(max(first, 1), last + 1):
+        level = abs(block.get(k, 0)) >> low
+        if level == 0:
+            zeros += 1
+        elif high and level > 1:
+            corrections.append(level & 1)
+        else:
+            bits.put(zeros << 4 | (1 if high else level.bit_length()), 8)
+            if high:
+                bits.put(block[k] > 0, 1)
+                for bit in corrections:
+                    bits.put(bit, 1)
+                corrections = []
+            else:
+                bits.value(level if block[k] > 0 else -level)
+            zeros = 0
+    if zeros or corrections:
+        bits.put(0, 8)
+        for bit in corrections:
+            bits.put(bit, 1)
+
+
+WHOLE = ((0, 63), (0, 0))
+HALVED = [(2, 2), (1, 1), (1, 1)]
+SEPARATE = [([c], *WHOLE) for c in range(3)]
+PROGRESSIVE = (
+    [([0, 1, 2], (0, 0), (0, 1))]
+    + [([c], (1, 63), (0, 1)) for c in range(3)]
+    + [([0, 1, 2], (0, 0), (1, 0))]
+    + [([c], (1, 63), (1, 0)) for c in range(3)]
+)
+
+
+def jpeg_layouts():
+    """JPEGs of the layouts that decoders treat each in its own way, and what viewers tolerate or miss."""
+    whole = jpeg(70, 50, HALVED, [([0, 1, 2], *WHOLE)])
+    restarts = jpeg(70, 50, HALVED, [([0, 1, 2], *WHOLE)], interval=2)
+    progressive = jpeg(70, 50, HALVED, PROGRESSIVE, progressive=True)
+    mark = restarts.index(b"\xff\xd0")
+    return {
+        "halved": whole,
+        "large": jpeg(200, 120, [(1, 1)] * 3, [([0, 1, 2], *WHOLE)]),
+        "separate": jpeg(70, 50, HALVED, SEPARATE),
+        "separate_restarts": jpeg(70, 50, HALVED, SEPARATE, interval=3),
+        "luma_then_colours": jpeg(70, 50, HALVED, [([0], *WHOLE), ([1, 2], *WHOLE)]),
+        "progressive": progressive,
+        "progressive_restarts": jpeg(70, 50, HALVED, PROGRESSIVE, progressive=True, interval=1),
+        "progressive_coarse": jpeg(70, 50, HALVED, PROGRESSIVE[:3], progressive=True),
+        "restarts": restarts,
+        "stray_before_restart": restarts[:mark] + b"stray" + restarts[mark:],
+        "without_restart": restarts[:mark] + restarts[mark + 2 :],
+        "grey": jpeg(70, 50, [(2, 2)], [([0], *WHOLE)]),
+        "inks": jpeg(70, 50, [(1, 1)] * 4, [([0, 1, 2, 3], *WHOLE)]),
+        "red_green_blue": jpeg(70, 50, [(1, 1)] * 3, [([0, 1, 2], *WHOLE)], ids=b"RGB"),
+        "quarter": jpeg(70, 50, [(4, 1), (1, 1), (1, 1)], [([0, 1, 2], *WHOLE)]),
+        "third": jpeg(70, 50, [(3, 1), (2, 1), (1, 1)], [([0, 1, 2], *WHOLE)]),
+        "small_luma": jpeg(70, 50, [(1, 1), (2, 2), (2, 2)], SEPARATE),
+        "without_tables": jpeg(70, 50, HALVED, [([0, 1, 2], *WHOLE)], tables=False),
+        "zeros_between": whole[:2] + segment(0xFE, b"") + b"\0\0" + whole[2:],
+        "without_end": whole[:-2],
+        "half_with_end": whole[: len(whole) // 2] + b"\xff\xd9",
+        "two": whole + progressive,
+        "means_and_nothing": jpeg(800, 800, [(1, 1)] * 3, PROGRESSIVE[:1], progressive=True),
+    }
+
+
+def tiff(orientation):
+    """An EXIF block that says which side is up."""
+    return b"II*\0\x08\0\0\0" + struct.pack("<HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
+
+
+def exif_jpeg(orientation, picture=JPEG):
+    return picture[:2] + segment(0xE1, b"Exif\0\0" + tiff(orientation)) + picture[2:]
+
+
+def exif_png(orientation):
+    body = b"eXIf" + tiff(orientation)
+    return png(5, 3, 2, 8, 15, struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body)))
+
+
+def exif_webp(orientation, picture):
+    block = tiff(orientation)
+    canvas = b"VP8X\x0a\0\0\0\x08\0\0\0" + bytes(6)
+    body = b"WEBP" + canvas + picture[12:] + b"EXIF" + struct.pack("<I", len(block)) + block
+    return b"RIFF" + struct.pack("<I", len(body)) + body
 
 
 def image_seeds():
@@ -65,7 +220,14 @@ def image_seeds():
         "png_huge_header": png(50000, 50000, 2, 8, 0)[:60],
         "text": b"this is not an image",
     }
-    seeds.update({f"jpeg_exif_{n}": exif_jpeg(n) for n in (1, 3, 6, 8)})
+    layouts = jpeg_layouts()
+    seeds.update({f"jpeg_{name}": picture for name, picture in layouts.items()})
+    for n in (1, 3, 6, 8):
+        seeds[f"jpeg_exif_{n}"] = exif_jpeg(n)
+        seeds[f"jpeg_progressive_exif_{n}"] = exif_jpeg(n, layouts["progressive"])
+        seeds[f"png_exif_{n}"] = exif_png(n)
+        seeds[f"webp_lossy_exif_{n}"] = exif_webp(n, WEBP_LOSSY)
+        seeds[f"webp_lossless_exif_{n}"] = exif_webp(n, WEBP_LOSSLESS)
     for folder in (ROOT.parent / "tests" / "golden",):
         for picture in sorted(folder.glob("*.png"))[:1]:
             if picture.stat().st_size < 200_000:

@@ -84,6 +84,7 @@ fn unknown_keys_and_wrong_types_are_named() {
         ("[image]\nmax_bytes = 0", "image.max_bytes"),
         ("[image]\nmax_side = 0", "image.max_side"),
         ("[image]\nmax_pixels = 0", "image.max_pixels"),
+        ("[image]\nmax_jpeg_samples = 0", "image.max_jpeg_samples"),
         ("[extract]\nexit_block = 12", "extract.exit_block"),
         ("[extract]\nhead = \"none\"", "extract.head"),
         (

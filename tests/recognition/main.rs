@@ -7,6 +7,7 @@ mod common;
 mod allocations;
 mod golden;
 mod golden_extract;
+mod image_containers;
 mod image_exif;
 mod image_golden;
 mod image_inputs;

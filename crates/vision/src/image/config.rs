@@ -16,6 +16,10 @@ pub struct ImageConfig {
     pub max_side: u32,
     /// Most pixels, width times height.
     pub max_pixels: u64,
+    /// Most samples that the scans of a JPEG may visit, all together. Each scan visits all samples
+    /// of its components: a baseline photo visits 1.5 to 3 for each pixel, a progressive one mostly
+    /// 8 to 14.
+    pub max_jpeg_samples: u64,
 }
 
 impl Default for ImageConfig {
@@ -24,6 +28,7 @@ impl Default for ImageConfig {
             max_bytes: 20 << 20,
             max_side: 16_384,
             max_pixels: 64_000_000,
+            max_jpeg_samples: 1_280_000_000,
         }
     }
 }
@@ -38,6 +43,7 @@ impl ImageConfig {
             ("image.max_bytes", self.max_bytes as u64),
             ("image.max_side", u64::from(self.max_side)),
             ("image.max_pixels", self.max_pixels),
+            ("image.max_jpeg_samples", self.max_jpeg_samples),
         ];
         for (field, value) in limits {
             if value == 0 {

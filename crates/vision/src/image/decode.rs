@@ -4,20 +4,14 @@ use super::config::ImageConfig;
 use super::error::ImageError;
 use super::header::{self, ImageFormat};
 use super::rgb::RgbImage;
-use ::image::codecs::{png::PngDecoder, webp::WebPDecoder};
-use ::image::{DynamicImage, ImageDecoder, Limits};
+use super::{jpeg, png, webp};
 use placeformer_core::types::ImageSize;
 use std::error::Error;
-use std::io::{self, Cursor, ErrorKind};
+use std::io::{self, ErrorKind};
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use zune_core::bytestream::ZCursor;
-use zune_core::colorspace::ColorSpace;
-use zune_core::options::DecoderOptions;
-use zune_jpeg::JpegDecoder;
-use zune_jpeg::errors::DecodeErrors;
 
 /// Why a file without all its bytes is refused.
-const ENDS_TOO_EARLY: &str = "truncated: the bytes end too early";
+pub(super) const ENDS_TOO_EARLY: &str = "truncated: the bytes end too early";
 
 /// Runs `work`, and turns a panic inside it into an error.
 pub(super) fn catch_panic<T>(
@@ -48,185 +42,20 @@ pub(super) fn decode_as_stored(
     needed: Option<ImageSize>,
 ) -> Result<RgbImage, ImageError> {
     match header::recognise(bytes, config)? {
-        ImageFormat::Jpeg => jpeg(bytes, config, needed),
-        ImageFormat::Png => png(bytes, config),
-        ImageFormat::WebP => webp(bytes, config),
+        ImageFormat::Jpeg => jpeg::decode(bytes, config, needed),
+        ImageFormat::Png => png::decode(bytes, config),
+        ImageFormat::WebP => webp::decode(bytes, config),
     }
-}
-
-fn png(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError> {
-    let format = ImageFormat::Png;
-    header::check_size(format, header::png_size(bytes)?, config)?;
-    let mut limits = Limits::no_limits();
-    limits.max_alloc = Some(decoded_limit(config));
-    let decoder = PngDecoder::with_limits(Cursor::new(bytes), limits);
-    let decoder = decoder.map_err(|error| image_error(format, &error))?;
-    read_pixels(format, decoder, config)
-}
-
-fn webp(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError> {
-    let format = ImageFormat::WebP;
-    if !header::webp_is_complete(bytes) {
-        return Err(format.undecodable(ENDS_TOO_EARLY));
-    }
-    let decoder = WebPDecoder::new(Cursor::new(bytes));
-    let decoder = decoder.map_err(|error| image_error(format, &error))?;
-    read_pixels(format, decoder, config)
 }
 
 /// Most bytes that decoded samples may take: RGBA at the pixel limit.
-fn decoded_limit(config: &ImageConfig) -> u64 {
+pub(super) fn decoded_limit(config: &ImageConfig) -> u64 {
     config.max_pixels.saturating_mul(4)
 }
 
-fn jpeg(
-    bytes: &[u8],
-    config: &ImageConfig,
-    needed: Option<ImageSize>,
-) -> Result<RgbImage, ImageError> {
-    let fail = |error: DecodeErrors| ImageFormat::Jpeg.undecodable(jpeg_reason(&error));
-    // The decoder's own limits are set as high as possible. Ours are checked below, on the header,
-    // with a better message.
-    let options = DecoderOptions::default()
-        .set_strict_mode(true)
-        .set_max_width(usize::from(u16::MAX))
-        .set_max_height(usize::from(u16::MAX))
-        .jpeg_set_max_scans(header::MAX_JPEG_SCANS)
-        .jpeg_set_out_colorspace(ColorSpace::RGB);
-    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
-    decoder.decode_headers().map_err(fail)?;
-    let (width, height) = decoder.dimensions().unwrap_or_default();
-    // The sides of a JPEG are 16-bit numbers, so the conversion loses nothing.
-    let size = ImageSize {
-        width: width as u32,
-        height: height as u32,
-    };
-    header::check_size(ImageFormat::Jpeg, size, config)?;
-    header::check_jpeg(bytes)?;
-
-    let is_plain_colour = decoder.input_colorspace() == Some(ColorSpace::YCbCr);
-    if is_plain_colour
-        && let Some(needed) = needed
-        && let Some(scale) = reduction(size, needed)
-    {
-        return jpeg_reduced(bytes, size, scale, config);
-    }
-    let pixels = decoder.decode().map_err(fail)?;
-    match decoder.output_colorspace() {
-        Some(ColorSpace::RGB) => Ok(RgbImage { size, pixels }),
-        other => {
-            let reason = format!("its colours ({other:?}) cannot be shown as RGB");
-            Err(ImageFormat::Jpeg.undecodable(reason))
-        }
-    }
-}
-
-/// The largest of the reductions 1/8, 1/4 and 1/2 that leaves both sides at least twice as long as
-/// needed; `None` if there is none.
-///
-/// The antialiased resize that follows averages the remaining pixels, so the result differs from
-/// that of a full decode by a level or two of 256.
-fn reduction(size: ImageSize, needed: ImageSize) -> Option<u32> {
-    let leaves_enough = |scale: &u32| {
-        size.width / scale >= 2 * needed.width && size.height / scale >= 2 * needed.height
-    };
-    [8, 4, 2].into_iter().find(leaves_enough)
-}
-
-/// Decodes at `1 / scale` of the size, which needs fewer coefficients and makes fewer pixels.
-fn jpeg_reduced(
-    bytes: &[u8],
-    size: ImageSize,
-    scale: u32,
-    config: &ImageConfig,
-) -> Result<RgbImage, ImageError> {
-    let fail = |error: jpeg_decoder::Error| ImageFormat::Jpeg.undecodable(error.to_string());
-    let limit = usize::try_from(decoded_limit(config)).unwrap_or(usize::MAX);
-    let mut decoder = jpeg_decoder::Decoder::new(bytes);
-    decoder.set_max_decoding_buffer_size(limit);
-    decoder.read_info().map_err(fail)?;
-    // The sides of a JPEG are 16-bit numbers, so the conversion loses nothing.
-    let side = |pixels: u32| pixels.div_ceil(scale) as u16;
-    let (width, height) = decoder
-        .scale(side(size.width), side(size.height))
-        .map_err(fail)?;
-    let pixels = decoder.decode().map_err(fail)?;
-    let reduced = ImageSize {
-        width: u32::from(width),
-        height: u32::from(height),
-    };
-    let expected = u64::from(reduced.width) * u64::from(reduced.height) * 3;
-    if pixels.len() as u64 != expected {
-        return Err(ImageFormat::Jpeg.undecodable("its colours cannot be shown as RGB"));
-    }
-    Ok(RgbImage {
-        size: reduced,
-        pixels,
-    })
-}
-
-/// The decoder's error in words that the sender of the image understands.
-fn jpeg_reason(error: &DecodeErrors) -> String {
-    match error {
-        DecodeErrors::ExhaustedData
-        | DecodeErrors::IoErrors(_)
-        | DecodeErrors::FormatStatic("Premature end of buffer") => ENDS_TOO_EARLY.to_owned(),
-        DecodeErrors::Format(reason) => reason.clone(),
-        DecodeErrors::FormatStatic(reason) => (*reason).to_owned(),
-        other => other.to_string(),
-    }
-}
-
-/// Checks the limits against the decoder's header, and decodes.
-fn read_pixels(
-    format: ImageFormat,
-    decoder: impl ImageDecoder,
-    config: &ImageConfig,
-) -> Result<RgbImage, ImageError> {
-    let (width, height) = decoder.dimensions();
-    let size = ImageSize { width, height };
-    header::check_size(format, size, config)?;
-    let bytes = decoder.total_bytes();
-    let limit = decoded_limit(config);
-    if bytes > limit {
-        return Err(ImageError::TooDeep { bytes, limit });
-    }
-    let image = DynamicImage::from_decoder(decoder);
-    let image = image.map_err(|error| image_error(format, &error))?;
-    Ok(RgbImage {
-        size,
-        pixels: into_rgb(image),
-    })
-}
-
-/// The pixels as 8-bit RGB, as Pillow converts them: 16-bit samples keep their high byte, alpha is
-/// dropped, grey is repeated.
-fn into_rgb(image: DynamicImage) -> Vec<u8> {
-    let high = |sample: &u16| (sample >> 8) as u8;
-    match image {
-        DynamicImage::ImageRgb16(image) => image.as_raw().iter().map(high).collect(),
-        DynamicImage::ImageRgba16(image) => image
-            .as_raw()
-            .chunks_exact(4)
-            .flat_map(|rgba| [high(&rgba[0]), high(&rgba[1]), high(&rgba[2])])
-            .collect(),
-        DynamicImage::ImageLuma16(image) => image
-            .as_raw()
-            .iter()
-            .flat_map(|grey| [high(grey); 3])
-            .collect(),
-        DynamicImage::ImageLumaA16(image) => image
-            .as_raw()
-            .chunks_exact(2)
-            .flat_map(|grey| [high(&grey[0]); 3])
-            .collect(),
-        other => other.into_rgb8().into_raw(),
-    }
-}
-
-/// The innermost cause of an error of the image crate, which is the one that says something.
-fn image_error(format: ImageFormat, error: &::image::ImageError) -> ImageError {
-    let mut cause: &(dyn Error + 'static) = error;
+/// The innermost cause of a decoder's error, which is the one that says something.
+pub(super) fn decoding_error(format: ImageFormat, error: &(dyn Error + 'static)) -> ImageError {
+    let mut cause = error;
     let mut ended_early = is_unexpected_end(cause);
     while let Some(deeper) = cause.source() {
         cause = deeper;
@@ -248,21 +77,6 @@ fn is_unexpected_end(error: &(dyn Error + 'static)) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn only_what_is_far_too_large_is_reduced() {
-        let size = |width, height| ImageSize { width, height };
-        assert_eq!(reduction(size(640, 480), size(448, 336)), None);
-        assert_eq!(reduction(size(1920, 1080), size(448, 336)), None);
-        assert_eq!(reduction(size(1920, 1400), size(448, 336)), Some(2));
-        assert_eq!(reduction(size(4032, 3024), size(448, 336)), Some(4));
-        assert_eq!(
-            reduction(size(8000, 700), size(448, 336)),
-            None,
-            "one side would become too short"
-        );
-        assert_eq!(reduction(size(16_000, 12_000), size(448, 336)), Some(8));
-    }
 
     #[test]
     fn a_panic_becomes_an_error_that_quotes_it() {

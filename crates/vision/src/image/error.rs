@@ -36,6 +36,21 @@ pub enum ImageError {
         /// The limit.
         limit: u64,
     },
+    /// A JPEG whose scans together are more work than allowed.
+    #[error(
+        "the image is {size} in {scans} scans, which visit {samples} samples; at most {limit} are \
+         accepted"
+    )]
+    TooManyScans {
+        /// Size in the header.
+        size: ImageSize,
+        /// How many scans it has.
+        scans: usize,
+        /// Samples that they visit.
+        samples: u64,
+        /// The limit.
+        limit: u64,
+    },
     /// Not too many pixels, but so many bytes for each that decoding would take more memory than
     /// the pixel limit allows.
     #[error("decoding the image takes {bytes} bytes; at most {limit} are allowed")]
@@ -81,9 +96,10 @@ impl ImageError {
         match self {
             Self::Empty => ErrorCode::EmptyImage,
             Self::TooManyBytes { .. } => ErrorCode::BodyTooLarge,
-            Self::SideTooLong { .. } | Self::TooManyPixels { .. } | Self::TooDeep { .. } => {
-                ErrorCode::ImageTooLarge
-            }
+            Self::SideTooLong { .. }
+            | Self::TooManyPixels { .. }
+            | Self::TooManyScans { .. }
+            | Self::TooDeep { .. } => ErrorCode::ImageTooLarge,
             Self::UnknownFormat { .. } => ErrorCode::UnsupportedMediaType,
             Self::Undecodable { .. } | Self::DecoderPanicked(_) => ErrorCode::ImageUndecodable,
             Self::EmptyTarget(_) | Self::Unencodable { .. } => ErrorCode::Internal,

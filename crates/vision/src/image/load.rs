@@ -4,6 +4,7 @@ use super::config::ImageConfig;
 use super::decode::{catch_panic, decode_as_stored};
 use super::error::ImageError;
 use super::exif;
+use super::header;
 use super::orientation::{stored_size, turn_upright};
 use super::resize;
 use super::rgb::RgbImage;
@@ -31,6 +32,8 @@ pub fn load_tensor(
     size: ImageSize,
 ) -> Result<ImageTensor, ImageError> {
     catch_panic(|| {
+        // Nothing reads bytes that are no image, or too many.
+        header::recognise(bytes, config)?;
         let orientation = exif::orientation(bytes);
         let stored_size = stored_size(orientation, size);
         let stored = decode_as_stored(bytes, config, Some(stored_size))?;

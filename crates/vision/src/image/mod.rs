@@ -14,7 +14,9 @@
 //! | module | holds |
 //! |---|---|
 //! | `load` | the whole way, from bytes to image or tensor |
-//! | `header`, `decode` | format and limits; one decoder for each format |
+//! | `header`, `decode` | format and limits; a way for each format |
+//! | `jpeg` | what of a JPEG is accepted, and which library decodes it |
+//! | `png`, `webp` | decoding these |
 //! | `orientation` | turning an image upright |
 //! | `resize` | resizing and normalisation |
 //! | `encode` | back to JPEG and PNG |
@@ -26,10 +28,13 @@ mod encode;
 mod error;
 mod exif;
 mod header;
+mod jpeg;
 mod load;
 mod orientation;
+mod png;
 mod resize;
 mod rgb;
+mod webp;
 
 pub use config::ImageConfig;
 pub use encode::{encode_jpeg, encode_png};

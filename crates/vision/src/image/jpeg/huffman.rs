@@ -1,0 +1,226 @@
+//! Huffman tables, and the bits of compressed data.
+
+use super::fault::Fault;
+use super::frame::StoredTable;
+
+/// Bits that the table is looked up with. Longer codes are rare.
+const LOOKUP_BITS: u32 = 10;
+
+/// A Huffman table, ready for decoding.
+pub(super) struct HuffmanTable<'a> {
+    symbols: &'a [u8],
+    /// By the next bits: the length of the code in the high byte, its symbol in the low one; 0 for
+    /// a longer code.
+    lookup: [u16; 1 << LOOKUP_BITS],
+    /// For each length: one past the last code of that length, moved to the top of 16 bits.
+    ends: [u32; 17],
+    /// For each length: what to add to a code to get the place of its symbol.
+    offsets: [i32; 17],
+}
+
+impl<'a> HuffmanTable<'a> {
+    /// Derives the codes (ITU-T T.81, annex C).
+    ///
+    /// # Errors
+    /// More codes than fit, or one that consists of 1 bits only, which the standard forbids.
+    pub fn new(stored: StoredTable<'a>) -> Result<Self, Fault> {
+        let mut table = Self {
+            symbols: stored.symbols,
+            lookup: [0; 1 << LOOKUP_BITS],
+            ends: [0; 17],
+            offsets: [0; 17],
+        };
+        let mut code = 0u32;
+        let mut place = 0usize;
+        for (length, &count) in (1u32..).zip(stored.counts) {
+            table.offsets[length as usize] = place as i32 - code as i32;
+            for _ in 0..count {
+                table.enter(length, code, place);
+                code += 1;
+                place += 1;
+            }
+            if count > 0 && code >= 1 << length {
+                return Err(Fault::BadTable);
+            }
+            table.ends[length as usize] = code << (16 - length);
+            code <<= 1;
+        }
+        Ok(table)
+    }
+
+    fn enter(&mut self, length: u32, code: u32, place: usize) {
+        if length > LOOKUP_BITS {
+            return;
+        }
+        let spare = LOOKUP_BITS - length;
+        let first = (code << spare) as usize;
+        let symbol = self.symbols.get(place).copied().unwrap_or_default();
+        let entry = (length as u16) << 8 | u16::from(symbol);
+        // A table with too many codes is refused right afterwards; here it must not go beyond.
+        if let Some(entries) = self.lookup.get_mut(first..first + (1 << spare)) {
+            entries.fill(entry);
+        }
+    }
+
+    /// Length and symbol of the code that `bits` (16 of them) begin with.
+    #[inline]
+    fn find(&self, bits: u32) -> Option<(u32, u8)> {
+        let entry = self.lookup[(bits >> (16 - LOOKUP_BITS)) as usize];
+        if entry != 0 {
+            return Some((u32::from(entry >> 8), entry as u8));
+        }
+        self.find_long(bits)
+    }
+
+    #[cold]
+    fn find_long(&self, bits: u32) -> Option<(u32, u8)> {
+        let lengths = LOOKUP_BITS + 1..=16;
+        let length = lengths
+            .into_iter()
+            .find(|&length| bits < self.ends[length as usize])?;
+        let code = (bits >> (16 - length)) as i32;
+        let place = usize::try_from(code + self.offsets[length as usize]).ok()?;
+        Some((length, *self.symbols.get(place)?))
+    }
+}
+
+/// The bits of compressed data, up to the next marker.
+///
+/// In compressed data `FF` stands as `FF 00`; any other byte behind `FF` makes it a marker.
+pub(super) struct Bits<'a> {
+    data: &'a [u8],
+    /// The next byte that is not yet in `buffer`.
+    at: usize,
+    /// The next bits, from the highest on. Below `count` there may be rubbish.
+    buffer: u64,
+    count: u32,
+}
+
+impl<'a> Bits<'a> {
+    pub fn new(data: &'a [u8]) -> Self {
+        Self {
+            data,
+            at: 0,
+            buffer: 0,
+            count: 0,
+        }
+    }
+
+    /// Fills the buffer to at least 32 bits, unless a marker or the end comes first.
+    #[inline]
+    fn fill(&mut self) {
+        if self.count >= 32 {
+            return;
+        }
+        if let Some(next) = self
+            .data
+            .get(self.at..)
+            .and_then(|rest| rest.first_chunk::<8>())
+        {
+            let word = u64::from_be_bytes(*next);
+            if !has_ff(word) {
+                self.buffer |= word >> self.count;
+                let bytes = (63 - self.count) / 8;
+                self.at += bytes as usize;
+                self.count += 8 * bytes;
+                return;
+            }
+        }
+        self.fill_slowly();
+    }
+
+    fn fill_slowly(&mut self) {
+        // The rubbish below `count` is what the fast way read ahead. It would mix with a byte that
+        // is escaped.
+        self.buffer &= !(u64::MAX.checked_shr(self.count).unwrap_or(0));
+        while self.count <= 56 {
+            let Some(&byte) = self.data.get(self.at) else {
+                return;
+            };
+            let step = if byte == 0xff { 2 } else { 1 };
+            if step == 2 && self.data.get(self.at + 1) != Some(&0) {
+                return;
+            }
+            self.buffer |= u64::from(byte) << (56 - self.count);
+            self.count += 8;
+            self.at += step;
+        }
+    }
+
+    #[inline]
+    fn take(&mut self, bits: u32) -> Result<(), Fault> {
+        if bits > self.count {
+            return Err(Fault::DataEnd);
+        }
+        self.buffer <<= bits;
+        self.count -= bits;
+        Ok(())
+    }
+
+    /// The next symbol. At least 16 bits remain in the buffer behind it, unless the data end.
+    #[inline]
+    pub fn symbol(&mut self, table: &HuffmanTable<'_>) -> Result<u8, Fault> {
+        self.fill();
+        let found = table.find((self.buffer >> 48) as u32);
+        let Some((length, symbol)) = found else {
+            // With fewer bits than a code may have, the rest of it may only be missing.
+            let missing = self.count < 16;
+            return Err(if missing {
+                Fault::DataEnd
+            } else {
+                Fault::BadCode
+            });
+        };
+        self.take(length)?;
+        Ok(symbol)
+    }
+
+    /// Skips up to 16 bits behind a symbol.
+    #[inline]
+    pub fn skip(&mut self, bits: u32) -> Result<(), Fault> {
+        self.take(bits)
+    }
+
+    /// The next bits, at most 16.
+    #[inline]
+    pub fn bits(&mut self, bits: u32) -> Result<u32, Fault> {
+        self.fill();
+        let value = (self.buffer >> 32 >> (32 - bits)) as u32;
+        self.take(bits)?;
+        Ok(value)
+    }
+
+    /// Skips any number of bits.
+    pub fn skip_many(&mut self, mut bits: u64) -> Result<(), Fault> {
+        while bits > 0 {
+            self.fill();
+            let step = bits.min(32).min(u64::from(self.count));
+            if step == 0 {
+                return Err(Fault::DataEnd);
+            }
+            self.take(step as u32)?;
+            bits -= step;
+        }
+        Ok(())
+    }
+
+    /// Bytes of which at least one bit was taken, with the zeros that escape an `FF`.
+    pub fn bytes_taken(&self) -> usize {
+        let mut at = self.at;
+        for _ in 0..self.count / 8 {
+            at -= 1;
+            if at > 0 && self.data[at] == 0 && self.data[at - 1] == 0xff {
+                at -= 1;
+            }
+        }
+        at
+    }
+}
+
+/// Whether one of the eight bytes is `FF`.
+#[inline]
+fn has_ff(word: u64) -> bool {
+    const LOW: u64 = u64::MAX / 255;
+    let inverted = !word;
+    inverted.wrapping_sub(LOW) & word & (LOW << 7) != 0
+}
