@@ -42,7 +42,7 @@ mod timings;
 pub use calibrations::MatchConfidence;
 pub use config::PipelineConfig;
 pub use error::PipelineError;
-pub use ingest::{IngestAnswer, IngestRequest};
+pub use ingest::{FieldSource, FieldSources, IngestAnswer, IngestRequest};
 pub use match_images::{MatchAnswer, MatchTarget, MatchedPair};
 pub use query::{QueryAnswer, QueryOptions, QueryRequest, QueryResult};
 pub use service::{Service, ServiceInfo};

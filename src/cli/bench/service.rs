@@ -66,6 +66,7 @@ impl MeasuredService for RunningPipeline {
                 map: map.clone(),
                 fields: ReferenceFields::default(),
                 image,
+                reads_photo: false,
             };
             self.service.ingest(request).await
         };

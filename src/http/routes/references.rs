@@ -1,6 +1,6 @@
 //! `/references`: the photos that make up the maps.
 
-use super::shapes::{ReferenceBody, json_object, point, present, timed};
+use super::shapes::{NewReferenceBody, ReferenceBody, json_object, point, present, timed};
 use crate::http::body::{ImageUpload, read_json, read_query, read_upload};
 use crate::http::examples;
 use crate::http::problem::ApiError;
@@ -80,6 +80,11 @@ pub struct ReferenceParams {
     #[param(value_type = Option<String>, example = "{\"camera\":\"left\"}")]
     #[serde(default, deserialize_with = "json_object")]
     pub metadata: Option<Map<String, Value>>,
+    /// Whether position, heading and time are read from the photo's EXIF and XMP where the request
+    /// gives none. A time without an offset from UTC is then taken as UTC. By default they are.
+    #[schema(default = true)]
+    #[param(example = true)]
+    pub exif: Option<bool>,
 }
 
 impl ReferenceParams {
@@ -106,7 +111,8 @@ impl ReferenceParams {
 ///
 /// Acknowledged only after it is durable and can be found. The image is the raw body with the
 /// fields as query parameters, or a multipart part `image` beside a part `json`, or base64 in JSON
-/// beside the fields.
+/// beside the fields. Position, heading and time that the request leaves out are taken from the
+/// photo's own EXIF or XMP, unless `exif` is false; `sources` says where each comes from.
 #[utoipa::path(
     post,
     path = "/references",
@@ -117,7 +123,7 @@ impl ReferenceParams {
         (
             status = 201,
             description = "It is new, durable and can be found.",
-            body = ReferenceBody,
+            body = NewReferenceBody,
             headers(
                 ("location" = String, description = "Its path."),
                 ("server-timing" = String, description = "Milliseconds per stage."),
@@ -126,7 +132,7 @@ impl ReferenceParams {
         (
             status = 200,
             description = "The same photo was there before under this external id.",
-            body = ReferenceBody,
+            body = NewReferenceBody,
             headers(
                 ("location" = String, description = "Its path."),
                 ("server-timing" = String, description = "Milliseconds per stage."),
@@ -140,10 +146,18 @@ pub async fn create(State(state): State<AppState>, request: Request) -> Result<R
     service.may_store()?;
     let mut upload = read_upload::<ReferenceParams>(&state, request, &UPLOAD).await?;
     let image = upload.take("image")?;
+    let reads_photo = upload.params.exif.unwrap_or(true);
     let (map, fields) = std::mem::take(&mut upload.params).checked()?;
-    let answer = service.ingest(IngestRequest { map, fields, image }).await?;
+    let request = IngestRequest {
+        map,
+        fields,
+        image,
+        reads_photo,
+    };
+    let answer = service.ingest(request).await?;
     let location = HeaderValue::from_str(&format!("/references/{}", answer.reference.id));
-    let mut response = timed(ReferenceBody::from(answer.reference), &answer.timings);
+    let body = NewReferenceBody::new(answer.reference, answer.sources);
+    let mut response = timed(body, &answer.timings);
     if answer.created {
         *response.status_mut() = StatusCode::CREATED;
     }

@@ -126,13 +126,14 @@ impl Values {
 
     fn take_attributes(&mut self, element: &BytesStart<'_>) {
         // Looking for attributes that are there twice would take quadratic time.
-        let attributes = || element.attributes().with_checks(false).flatten();
-        for attribute in attributes() {
+        let mut attributes = element.attributes();
+        for attribute in attributes.with_checks(false).flatten() {
             if let Some(prefix) = attribute.key.as_ref().strip_prefix(b"xmlns:") {
                 self.add_namespace(prefix, &attribute.value);
             }
         }
-        for attribute in attributes() {
+        let mut attributes = element.attributes();
+        for attribute in attributes.with_checks(false).flatten() {
             if let Some(property) = self.property(attribute.key.as_ref()) {
                 self.add(property, &attribute.value);
             }
