@@ -5,5 +5,6 @@ mod common;
 
 mod commands;
 mod eval;
+mod import;
 mod own_weights;
 mod train;

@@ -16,6 +16,7 @@ mod errors;
 mod index_rebuild;
 mod killed;
 mod logs;
+mod photo_metadata;
 mod process;
 mod rehead;
 mod routes;
