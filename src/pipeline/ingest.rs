@@ -182,7 +182,11 @@ impl Service {
         let image = request.image.clone();
         let reads_photo = request.reads_photo;
         let work = move || {
-            let photo = reads_photo.then(|| read_exif(&image)).unwrap_or_default();
+            let photo = if reads_photo {
+                read_exif(&image)
+            } else {
+                ExifInfo::default()
+            };
             (ContentHash::of(&image), photo)
         };
         let seen = self.extraction.on_decoder_thread(ticket, work).await?;

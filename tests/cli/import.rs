@@ -104,7 +104,10 @@ impl Served {
     fn import_from(&self, from: &str, more: &[&str]) -> Imported {
         let fixed = words("import --map m --report report.jsonl --attempts 1 --server");
         let arguments = [&fixed[..], &[&self.url, from], more].concat();
-        imported(self.folder.path(), &mut offline(self.folder.path(), &arguments))
+        imported(
+            self.folder.path(),
+            &mut offline(self.folder.path(), &arguments),
+        )
     }
 
     /// Location and time that the map has of a photo.
@@ -127,7 +130,9 @@ impl Served {
 fn imported(folder: &Path, command: &mut std::process::Command) -> Imported {
     let output = command.output().expect("the binary was built");
     let report = std::fs::read_to_string(folder.join("report.jsonl")).unwrap_or_default();
-    let lines = report.lines().map(|line| serde_json::from_str(line).unwrap());
+    let lines = report
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap());
     Imported {
         success: output.status.success(),
         said: String::from_utf8(output.stdout).unwrap(),
@@ -150,7 +155,15 @@ fn what_is_no_photo_gets_a_verdict_and_the_others_are_imported() {
     for name in ["a.png", "b.jfif", "c.JPE", "sub/d.webp"] {
         served.photo(name);
     }
-    for name in ["x.heic", "y.HEIC", "clip.mp4", "._a.png", ".DS_Store", "Thumbs.db", "notes"] {
+    for name in [
+        "x.heic",
+        "y.HEIC",
+        "clip.mp4",
+        "._a.png",
+        ".DS_Store",
+        "Thumbs.db",
+        "notes",
+    ] {
         served.write(name, b"x");
     }
     served.photo("@eaDir/a.png/SYNOPHOTO_THUMB_M.png");
@@ -180,7 +193,10 @@ fn what_is_no_photo_gets_a_verdict_and_the_others_are_imported() {
         ("pipe.jpg", "special_file"),
     ] {
         assert_eq!(imported.verdict(name), ("failed", code), "{name}");
-        assert!(imported.errors.contains(&format!("{name}: ")), "{imported:#?}");
+        assert!(
+            imported.errors.contains(&format!("{name}: ")),
+            "{imported:#?}"
+        );
     }
     for (name, code) in [
         ("x.heic", "unsupported_file"),
@@ -198,15 +214,27 @@ fn what_is_no_photo_gets_a_verdict_and_the_others_are_imported() {
     }
     assert_eq!(imported.lines.len(), 5 + 5 + 11);
     let said = &imported.said;
-    assert!(said.contains("5 created, 0 already there, 5 failed, 11 ignored"), "{said}");
+    assert!(
+        said.contains("5 created, 0 already there, 5 failed, 11 ignored"),
+        "{said}"
+    );
     assert!(said.contains("2 heic") && said.contains("1 mp4"), "{said}");
     assert!(imported.errors.contains("5 of 10 photos"), "{imported:#?}");
 
-    for name in ["dangling.jpg", "loop.jpg", "zero.jpg", "socket.jpg", "pipe.jpg"] {
+    for name in [
+        "dangling.jpg",
+        "loop.jpg",
+        "zero.jpg",
+        "socket.jpg",
+        "pipe.jpg",
+    ] {
         std::fs::remove_file(path(name)).unwrap();
     }
     let again = served.import(&[]).succeeded();
-    assert!(again.said.contains("0 created, 5 already there, 0 failed"), "{again:#?}");
+    assert!(
+        again.said.contains("0 created, 5 already there, 0 failed"),
+        "{again:#?}"
+    );
 }
 
 #[test]
@@ -252,9 +280,18 @@ fn names_are_kept_apart_and_shown_without_effect() {
     served.photo("caf\u{e9}.png");
     let hostile = "\u{1b}[31mred\u{202e}gpj.png";
     served.write(hostile, b"no image");
-    symlink("nowhere", served.photos().join("\u{1b}]0;title\u{7}\u{2066}.jpg")).unwrap();
+    symlink(
+        "nowhere",
+        served.photos().join("\u{1b}]0;title\u{7}\u{2066}.jpg"),
+    )
+    .unwrap();
     let imported = served.import(&[]).failed();
-    for name in ["caf\\xe9.png", "caf\\xea.png", "caf\u{e9}.png", "new\\x0aline.png"] {
+    for name in [
+        "caf\\xe9.png",
+        "caf\\xea.png",
+        "caf\u{e9}.png",
+        "new\\x0aline.png",
+    ] {
         assert_eq!(imported.verdict(name), ("created", ""), "{name}");
         served.stored(name);
     }
@@ -265,7 +302,9 @@ fn names_are_kept_apart_and_shown_without_effect() {
     // Folders and tables have names, too.
     let missing = served.import_from("no\u{1b}where\n", &[]).failed();
     assert!(!missing.errors.contains('\u{1b}'), "{missing:?}");
-    let table = served.import(&["--positions", "no\u{1b}where.csv"]).failed();
+    let table = served
+        .import(&["--positions", "no\u{1b}where.csv"])
+        .failed();
     assert!(!table.errors.contains('\u{1b}'), "{table:?}");
 }
 
@@ -278,7 +317,11 @@ fn one_photo_is_imported_and_a_folder_without_any_says_what_it_holds() {
     assert!(nothing.errors.contains("1 mov"), "{nothing:#?}");
     assert_eq!(nothing.verdict("clip.mov"), ("ignored", "unsupported_file"));
     served.photo("one.png");
-    std::fs::write(served.folder.path().join("p.csv"), "file,lat,lon\none.png,1,2\n").unwrap();
+    std::fs::write(
+        served.folder.path().join("p.csv"),
+        "file,lat,lon\none.png,1,2\n",
+    )
+    .unwrap();
     let from = ["--positions", "p.csv"];
     served.import_from("photos/one.png", &from).succeeded();
     assert_eq!(served.stored("one.png").0, at(1.0, 2.0));
@@ -300,16 +343,33 @@ fn positions_arrive_at_photos_that_are_there_and_are_told() {
     assert_eq!(served.stored("0.png"), (Value::Null, Value::Null));
     // What the photos say fills the gaps.
     let filled = served.import(&[]).succeeded();
-    assert!(filled.said.contains("0 created, 2 updated, 1 already there"), "{filled:#?}");
+    assert!(
+        filled
+            .said
+            .contains("0 created, 2 updated, 1 already there"),
+        "{filled:#?}"
+    );
     let utc = json!("2026-03-01T14:30:05Z");
     assert_eq!(served.stored("0.png"), (at(10.0, 20.0), utc));
-    assert_eq!(filled.line("0.png")["changed"], json!(["location", "captured_at"]));
+    assert_eq!(
+        filled.line("0.png")["changed"],
+        json!(["location", "captured_at"])
+    );
 
     let table = served.folder.path().join("positions.csv");
-    std::fs::write(&table, "\u{feff}File;Latitude;LNG\r\n0.png;48,85;2,29\r\nbare.png;1;2\r\n").unwrap();
+    std::fs::write(
+        &table,
+        "\u{feff}File;Latitude;LNG\r\n0.png;48,85;2,29\r\nbare.png;1;2\r\n",
+    )
+    .unwrap();
     let from = ["--positions", "positions.csv"];
     let updated = served.import(&from).succeeded();
-    assert!(updated.said.contains("0 created, 2 updated, 1 already there"), "{updated:#?}");
+    assert!(
+        updated
+            .said
+            .contains("0 created, 2 updated, 1 already there"),
+        "{updated:#?}"
+    );
     assert_eq!(updated.verdict("0.png"), ("updated", ""));
     assert_eq!(updated.verdict("1.png"), ("skipped", ""));
     assert_eq!(served.stored("0.png").0, at(48.85, 2.29));
@@ -317,7 +377,10 @@ fn positions_arrive_at_photos_that_are_there_and_are_told() {
     // Without the table nothing falls back, and with it nothing is left to do.
     for arguments in [&[][..], &from] {
         let again = served.import(arguments).succeeded();
-        assert!(again.said.contains("0 created, 3 already there"), "{again:#?}");
+        assert!(
+            again.said.contains("0 created, 3 already there"),
+            "{again:#?}"
+        );
     }
     assert_eq!(served.stored("0.png").0, at(48.85, 2.29));
 
@@ -355,7 +418,10 @@ fn names_with_positions_that_cannot_be_are_told() {
         assert!(imported.line(name)["warning"].is_string(), "{imported:#?}");
         assert!(imported.errors.contains(name), "{imported:#?}");
     }
-    assert!(imported.said.contains("2 names carry a wrong position"), "{imported:#?}");
+    assert!(
+        imported.said.contains("2 names carry a wrong position"),
+        "{imported:#?}"
+    );
 }
 
 #[test]
@@ -370,12 +436,18 @@ fn a_hostile_exif_block_does_not_end_an_import() {
     }
     bomb.resize(bomb.len() + 865_539, 0xff);
     served.write("bare.jpg", &bomb);
-    served.write("hidden.png", &with_chunk(&picture("hidden"), b"eXIf", &bomb));
+    served.write(
+        "hidden.png",
+        &with_chunk(&picture("hidden"), b"eXIf", &bomb),
+    );
     served.photo("z.png");
     let imported = served.import(&[]).failed();
     assert_eq!(imported.verdict("hidden.png"), ("created", ""));
     assert_eq!(imported.verdict("z.png"), ("created", ""));
-    assert_eq!(imported.verdict("bare.jpg"), ("failed", "unsupported_media_type"));
+    assert_eq!(
+        imported.verdict("bare.jpg"),
+        ("failed", "unsupported_media_type")
+    );
 }
 
 #[test]
@@ -403,7 +475,10 @@ fn a_store_is_filled_and_updated_as_a_server_is() {
     };
     assert!(run(&[]).contains("2 created, 0 already there, 0 failed, 1 ignored"));
     let said = run(&["--positions", "p.csv"]);
-    assert!(said.contains("0 created, 1 updated, 1 already there"), "{said}");
+    assert!(
+        said.contains("0 created, 1 updated, 1 already there"),
+        "{said}"
+    );
     let said = run(&["--positions", "p.csv"]);
     assert!(said.contains("0 created, 2 already there"), "{said}");
 }

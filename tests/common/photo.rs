@@ -56,8 +56,15 @@ pub fn exif_block(says: Says) -> Vec<u8> {
         gps.push(text(3, if lon < 0.0 { "W" } else { "E" }));
         gps.push(millionths(4, lon));
     }
-    gps.extend(says.heading.map(|degrees| millionths(17, f64::from(degrees))));
-    let exif: Vec<Entry> = says.time.map(|time| text(0x9003, time)).into_iter().collect();
+    gps.extend(
+        says.heading
+            .map(|degrees| millionths(17, f64::from(degrees))),
+    );
+    let exif: Vec<Entry> = says
+        .time
+        .map(|time| text(0x9003, time))
+        .into_iter()
+        .collect();
     let pointer = |tag: u16, at: usize| (tag, 4, 1, (at as u32).to_be_bytes().to_vec());
     // Header, and a directory of two pointers.
     let exif_at = 8 + 2 + 2 * 12 + 4;

@@ -32,7 +32,9 @@ async fn what_the_request_leaves_out_is_read_from_the_photo() {
     let stored = app.get(created.header("location")).await;
     assert_eq!(stored.ok()["location"], location);
     assert_eq!(stored.json["sources"], Value::Null);
-    let again = app.post(&format!("{path}&lat=1&lon=2"), "image/png", photo).await;
+    let again = app
+        .post(&format!("{path}&lat=1&lon=2"), "image/png", photo)
+        .await;
     assert_eq!(again.ok()["location"], location);
     let stored = || json!("stored");
     assert_eq!(again.json["sources"], sources(stored(), stored(), stored()));
@@ -82,7 +84,10 @@ async fn the_photo_is_left_alone_where_the_request_says_so() {
         .await;
     for answer in [raw, parts, base64] {
         let body = answer.created();
-        assert_eq!((&body["location"], &body["captured_at"]), (&Value::Null, &Value::Null));
+        assert_eq!(
+            (&body["location"], &body["captured_at"]),
+            (&Value::Null, &Value::Null)
+        );
         assert_eq!(body["sources"], nothing);
     }
     let wrong = app
@@ -108,7 +113,10 @@ async fn xmp_is_read_too_and_a_photo_may_say_nothing() {
     let body = app.post_png("/references?map=m", 2).await;
     let body = body.created();
     assert_eq!(body["location"], Value::Null);
-    assert_eq!(body["sources"], sources(Value::Null, Value::Null, Value::Null));
+    assert_eq!(
+        body["sources"],
+        sources(Value::Null, Value::Null, Value::Null)
+    );
 }
 
 #[tokio::test]

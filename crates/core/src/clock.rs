@@ -181,7 +181,11 @@ mod tests {
             ("2026:03:01 14:30:05Z", noon, Some(offset!(UTC))),
             ("2026:03:01 14:30:05+02:00", noon, Some(offset!(+2))),
             ("2026:03:01 14:30:05 -0330", noon, Some(offset!(-3:30))),
-            ("2026-03-01t14:30:05.847z", with_fraction, Some(offset!(UTC))),
+            (
+                "2026-03-01t14:30:05.847z",
+                with_fraction,
+                Some(offset!(UTC)),
+            ),
             ("2026-03-01T14:30:05+05", noon, Some(offset!(+5))),
             ("2026-03-01T14:30", datetime!(2026-03-01 14:30), None),
         ] {

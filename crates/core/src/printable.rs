@@ -60,6 +60,9 @@ mod tests {
         assert_eq!(shown("a\u{1b}[31mb\nc"), "a\\u{1b}[31mb\\nc");
         assert_eq!(shown("gpj.\u{202e}exe"), "gpj.\\u{202e}exe");
         assert_eq!(shown("\u{9b}1m\u{7f}"), "\\u{9b}1m\\u{7f}");
-        assert_eq!(shown("it's \"caf\u{e9}\" e\u{301} \\ ok"), "it's \"caf\u{e9}\" e\u{301} \\ ok");
+        assert_eq!(
+            shown("it's \"caf\u{e9}\" e\u{301} \\ ok"),
+            "it's \"caf\u{e9}\" e\u{301} \\ ok"
+        );
     }
 }

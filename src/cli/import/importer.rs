@@ -253,7 +253,12 @@ fn conflict() -> Failure {
 /// it was given to this import; nothing is ever cleared.
 fn difference(stored: &Stored, facts: &PhotoFacts) -> (ReferencePatch, Vec<&'static str>) {
     let PhotoFacts { fields, given, .. } = facts;
-    let location = better(fields.location, stored.location, given.location, PartialEq::eq);
+    let location = better(
+        fields.location,
+        stored.location,
+        given.location,
+        PartialEq::eq,
+    );
     let heading = better(fields.heading, stored.heading, given.heading, PartialEq::eq);
     let captured_at = better(
         fields.captured_at,

@@ -28,7 +28,7 @@ use placeformer_core::folder::{FolderScan, PassedOver, scan_folder};
 use placeformer_core::geography::UtmZone;
 use placeformer_core::printable::Printable;
 use placeformer_core::types::MapName;
-use positions::Positions;
+use positions::{Positions, folder_of};
 use report::{ImportReport, PhotoRecord, Summary, describe_ignored};
 use server_sink::ServerSink;
 use sink::Sink;
@@ -182,7 +182,7 @@ fn read_metadata(args: &ImportArgs, images: &[(String, PathBuf)]) -> anyhow::Res
         Some(path) => {
             // A single photo is named by its path below the folder in which it lies.
             let folder = match args.folder.is_file() {
-                true => args.folder.parent().unwrap_or(&args.folder),
+                true => folder_of(&args.folder),
                 false => &args.folder,
             };
             Positions::read(path, folder, images, timezone.as_ref())?
@@ -242,7 +242,11 @@ fn open_sink(args: &ImportArgs) -> anyhow::Result<Box<dyn Sink>> {
             api_key: args.api_key.clone(),
             timeout: args.timeout,
         };
-        return Ok(Box::new(ServerSink::new(server, args.attempts, args.no_exif)?));
+        return Ok(Box::new(ServerSink::new(
+            server,
+            args.attempts,
+            args.no_exif,
+        )?));
     }
     let Some(data) = &args.data else {
         bail!("give --server or --data");

@@ -206,7 +206,9 @@ pub(super) fn describe_ignored(entries: &[PassedOver]) -> String {
     counts.sort_by_key(|(_, count)| Reverse(*count));
     let rest: usize = counts.iter().skip(NAMED).map(|(_, count)| count).sum();
     let named = counts.iter().take(NAMED);
-    let mut parts: Vec<String> = named.map(|(kind, count)| format!("{count} {kind}")).collect();
+    let mut parts: Vec<String> = named
+        .map(|(kind, count)| format!("{count} {kind}"))
+        .collect();
     if rest > 0 {
         parts.push(format!("{rest} others"));
     }

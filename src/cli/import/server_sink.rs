@@ -378,7 +378,10 @@ mod tests {
         assert_eq!(present.len(), 2);
         assert_eq!(present["a"].content.to_string(), "1".repeat(64));
         assert_eq!(present["a"].location, GeoPoint::new(1.5, -2.25).ok());
-        assert_eq!(present["a"].captured_at.unwrap().unix_timestamp(), 1_779_010_200);
+        assert_eq!(
+            present["a"].captured_at.unwrap().unix_timestamp(),
+            1_779_010_200
+        );
         assert_eq!((present["b"].location, present["b"].heading), (None, None));
         assert!(requests.iter().nth(1).unwrap().contains("cursor=n1"));
         assert!(sink.present(&map).unwrap().is_empty());
@@ -407,6 +410,9 @@ mod tests {
         let gone = sink.update(id, ReferencePatch::default());
         assert!(matches!(gone.outcome, Outcome::Refused { .. }), "{gone:?}");
         let request = requests.recv().unwrap();
-        assert!(request.starts_with(&format!("PATCH /references/{ID} ")), "{request}");
+        assert!(
+            request.starts_with(&format!("PATCH /references/{ID} ")),
+            "{request}"
+        );
     }
 }

@@ -82,19 +82,34 @@ mod tests {
     fn regions_have_summers_and_offsets_have_none() {
         let winter = datetime!(2026-01-01 12:00);
         let summer = datetime!(2026-07-01 12:00:00.5);
-        assert_eq!(instant("Europe/Paris", winter), datetime!(2026-01-01 11:00 UTC));
-        assert_eq!(instant("Europe/Paris", summer), datetime!(2026-07-01 10:00:00.5 UTC));
+        assert_eq!(
+            instant("Europe/Paris", winter),
+            datetime!(2026-01-01 11:00 UTC)
+        );
+        assert_eq!(
+            instant("Europe/Paris", summer),
+            datetime!(2026-07-01 10:00:00.5 UTC)
+        );
         assert_eq!(instant("+02:00", winter), datetime!(2026-01-01 10:00 UTC));
         assert_eq!(instant("Z", winter), datetime!(2026-01-01 12:00 UTC));
-        assert_eq!(instant("America/New_York", winter), datetime!(2026-01-01 17:00 UTC));
+        assert_eq!(
+            instant("America/New_York", winter),
+            datetime!(2026-01-01 17:00 UTC)
+        );
     }
 
     #[test]
     fn hours_that_come_twice_or_never_have_one_meaning() {
         let twice = datetime!(2026-10-25 02:30);
-        assert_eq!(instant("Europe/Paris", twice), datetime!(2026-10-25 00:30 UTC));
+        assert_eq!(
+            instant("Europe/Paris", twice),
+            datetime!(2026-10-25 00:30 UTC)
+        );
         let never = datetime!(2026-03-29 02:30);
-        assert_eq!(instant("Europe/Paris", never), datetime!(2026-03-29 01:30 UTC));
+        assert_eq!(
+            instant("Europe/Paris", never),
+            datetime!(2026-03-29 01:30 UTC)
+        );
     }
 
     #[test]

@@ -96,7 +96,8 @@ pub fn scan_folder(folder: &Path) -> Result<FolderScan, FolderError> {
         }
     }
     scan.images.sort_unstable();
-    scan.passed_over.sort_unstable_by(|a, b| a.name.cmp(&b.name));
+    scan.passed_over
+        .sort_unstable_by(|a, b| a.name.cmp(&b.name));
     Ok(scan)
 }
 

@@ -81,7 +81,10 @@ fn a_scan_says_of_everything_why_it_is_no_image() {
     symlink("/dev/null", path("null.jpg")).unwrap();
     let _socket = UnixListener::bind(path("socket.jpg")).unwrap();
     let scan = scan_folder(root.path()).unwrap();
-    assert_eq!(names(&scan.images), ["a.jpg", "other_name.jpg", "sub/c.jpg"]);
+    assert_eq!(
+        names(&scan.images),
+        ["a.jpg", "other_name.jpg", "sub/c.jpg"]
+    );
     let expected = [
         (".DS_Store", "hidden", false),
         ("._a.jpg", "resource_fork", false),

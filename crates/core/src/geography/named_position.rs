@@ -71,7 +71,9 @@ impl UtmName {
         match zone.band {
             // Whether the letter is the band or means "north", the position is the same.
             'N' => Ok((Some(point), Some(wrong))),
-            'S' => Err(format!("{wrong}; if S means south, the band is another letter")),
+            'S' => Err(format!(
+                "{wrong}; if S means south, the band is another letter"
+            )),
             _ => Err(wrong),
         }
     }
@@ -124,16 +126,28 @@ mod tests {
         let found = position("@500000@5000000@33@T@.jpg", Some("10S"));
         assert_near(&found, 45.153_48, 15.0);
         assert_eq!(found.doubt, None);
-        assert_near(&position("@500000@5000000@.jpg", Some("33T")), 45.153_48, 15.0);
+        assert_near(
+            &position("@500000@5000000@.jpg", Some("33T")),
+            45.153_48,
+            15.0,
+        );
         // A common zone is right for the band beside it, too.
-        assert_near(&position("@500000@5400000@.jpg", Some("33T")), 48.753_01, 15.0);
+        assert_near(
+            &position("@500000@5400000@.jpg", Some("33T")),
+            48.753_01,
+            15.0,
+        );
     }
 
     #[test]
     fn coordinates_that_cannot_be_are_refused_with_the_reason() {
         for (name, zone, reason) in [
             ("@48.85@2.29@.jpg", None, "no UTM coordinates"),
-            ("@48.85@2.29@.jpg", Some("31U"), "no coordinates of UTM zone 31U"),
+            (
+                "@48.85@2.29@.jpg",
+                Some("31U"),
+                "no coordinates of UTM zone 31U",
+            ),
             ("@0261878@6243186@34@S@.jpg", None, "if S means south"),
             ("@0261878@6243186@34@T@.jpg", None, "not in band 34T"),
             ("@500000@5000000@.jpg", None, "no UTM zone"),
@@ -146,7 +160,11 @@ mod tests {
             assert!(found.doubt.unwrap().contains(reason), "{name}");
         }
         // Cape Town, with the band that it lies in.
-        assert_near(&position("@0261878@6243186@34@H@.jpg", None), -33.924_87, 18.424_06);
+        assert_near(
+            &position("@0261878@6243186@34@H@.jpg", None),
+            -33.924_87,
+            18.424_06,
+        );
     }
 
     #[test]
@@ -161,7 +179,10 @@ mod tests {
         let found = position("@500000@5000000@33@T@45.1534@15.0@.jpg", None);
         assert_eq!(found.doubt, None);
         // One decimal is good for 11 km.
-        assert_eq!(position("@500000@5000000@33@T@45.2@15.1@.jpg", None).doubt, None);
+        assert_eq!(
+            position("@500000@5000000@33@T@45.2@15.1@.jpg", None).doubt,
+            None
+        );
         let found = position("@500000@5000000@33@T@45.2534@15.0@.jpg", None);
         assert_near(&found, 45.153_48, 15.0);
         assert!(found.doubt.unwrap().contains("apart"));

@@ -74,7 +74,9 @@ impl UtmName {
 
 /// The length of one unit of the last decimal of an angle in degrees, on a meridian.
 fn tolerance_m(degrees: &str) -> f64 {
-    let decimals = degrees.split_once('.').map_or(0, |(_, decimals)| decimals.len());
+    let decimals = degrees
+        .split_once('.')
+        .map_or(0, |(_, decimals)| decimals.len());
     METRES_PER_DEGREE / 10f64.powi(decimals.min(15) as i32)
 }
 

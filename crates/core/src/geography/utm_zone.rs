@@ -115,8 +115,14 @@ mod tests {
     fn bands_lie_on_top_of_each_other() {
         let latitudes = |text: &str| text.parse::<UtmZone>().unwrap().latitudes();
         assert_eq!(latitudes("1C"), (-80.0, -72.0));
-        assert_eq!((latitudes("1M"), latitudes("1N")), ((-8.0, 0.0), (0.0, 8.0)));
-        assert_eq!((latitudes("1S"), latitudes("1X")), ((32.0, 40.0), (72.0, 84.0)));
+        assert_eq!(
+            (latitudes("1M"), latitudes("1N")),
+            ((-8.0, 0.0), (0.0, 8.0))
+        );
+        assert_eq!(
+            (latitudes("1S"), latitudes("1X")),
+            ((32.0, 40.0), (72.0, 84.0))
+        );
     }
 
     #[test]

@@ -242,7 +242,10 @@ fn a_required_position_may_be_the_maps() {
         (summary.created, summary.skipped, summary.failed)
     };
     let csv = "file,lat,lon\na.jpg,1,2\n";
-    assert_eq!(require(Run::into(&sink).with_positions(&photos, csv)), (1, 0, 1));
+    assert_eq!(
+        require(Run::into(&sink).with_positions(&photos, csv)),
+        (1, 0, 1)
+    );
     let failed = lines(&report);
     let failed = failed.iter().find(|line| line["status"] == "failed");
     let detail = failed.unwrap()["detail"].to_string();

@@ -143,7 +143,8 @@ fn normalise(file: &str) -> String {
     format!("{root}{}", parts.join("/"))
 }
 
-fn folder_of(file: &Path) -> &Path {
+/// The folder in which a file lies.
+pub(in crate::cli::import) fn folder_of(file: &Path) -> &Path {
     let parent = file.parent().unwrap_or(file);
     if parent.as_os_str().is_empty() {
         Path::new(".")
@@ -157,7 +158,11 @@ fn folder_spellings(folder: &Path) -> Vec<String> {
     let given = std::path::absolute(folder).ok();
     let real = folder.canonicalize().ok();
     let spelled = |path: PathBuf| Some(normalise(path.to_str()?) + "/");
-    let mut spellings: Vec<String> = [given, real].into_iter().flatten().filter_map(spelled).collect();
+    let mut spellings: Vec<String> = [given, real]
+        .into_iter()
+        .flatten()
+        .filter_map(spelled)
+        .collect();
     spellings.dedup();
     spellings
 }

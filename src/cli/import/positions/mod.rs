@@ -9,6 +9,7 @@ mod table;
 use super::timezone::ClockZone;
 use anyhow::{Context, ensure};
 use matching::PhotoNames;
+pub(super) use matching::folder_of;
 use placeformer_core::printable::Printable;
 use placeformer_core::types::{GeoPoint, Heading};
 use std::collections::{BTreeSet, HashMap};

@@ -22,15 +22,37 @@ type Synonyms = (&'static str, &'static [&'static str]);
 const FILE: Synonyms = (
     "file",
     &[
-        "file", "filename", "sourcefile", "image", "imagename", "imagefile", "photo", "path",
-        "filepath", "imagepath", "name", "key",
+        "file",
+        "filename",
+        "sourcefile",
+        "image",
+        "imagename",
+        "imagefile",
+        "photo",
+        "path",
+        "filepath",
+        "imagepath",
+        "name",
+        "key",
     ],
 );
 const LAT: Synonyms = ("lat", &["lat", "latitude", "gpslatitude", "y"]);
-const LON: Synonyms = ("lon", &["lon", "lng", "long", "longitude", "gpslongitude", "x"]);
+const LON: Synonyms = (
+    "lon",
+    &["lon", "lng", "long", "longitude", "gpslongitude", "x"],
+);
 const HEADING: Synonyms = (
     "heading",
-    &["heading", "headingdeg", "bearing", "azimuth", "compassangle", "gpsimgdirection", "yaw", "ca"],
+    &[
+        "heading",
+        "headingdeg",
+        "bearing",
+        "azimuth",
+        "compassangle",
+        "gpsimgdirection",
+        "yaw",
+        "ca",
+    ],
 );
 const CAPTURED_AT: Synonyms = (
     "captured_at",
@@ -63,7 +85,12 @@ pub(super) fn read(bytes: &[u8], zone: Option<&ClockZone>) -> anyhow::Result<Tab
         Some((first, rest)) if first.starts_with("sep=") => rest,
         _ => &text,
     };
-    let headings = |delimiter: u8| reader(text, delimiter).headers().cloned().unwrap_or_default();
+    let headings = |delimiter: u8| {
+        reader(text, delimiter)
+            .headers()
+            .cloned()
+            .unwrap_or_default()
+    };
     let known = |delimiter: &u8| Columns::find(&headings(*delimiter)).known();
     // The first of the best, as the usual delimiter stands first.
     let best = DELIMITERS.into_iter().rev().max_by_key(known);

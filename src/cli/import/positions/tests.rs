@@ -41,7 +41,11 @@ fn tables_of_every_dialect_are_read() {
         assert!(positions.unmatched.is_empty(), "{csv}");
     }
     let positions = read("file,lat,lon,junk,more\na.jpg,1,2,3,4\n").unwrap();
-    assert!(positions.columns.contains("2 other columns"), "{}", positions.columns);
+    assert!(
+        positions.columns.contains("2 other columns"),
+        "{}",
+        positions.columns
+    );
 }
 
 #[test]
@@ -97,7 +101,11 @@ fn rows_find_their_photo_however_they_spell_it() {
         let positions = Positions::read(&path, &photos_folder, &names, None).unwrap();
         let rows: Vec<&str> = positions.rows.keys().map(String::as_str).collect();
         assert_eq!(rows, Vec::from_iter(found), "{spelling}");
-        assert_eq!(positions.unmatched.len(), usize::from(found.is_none()), "{spelling}");
+        assert_eq!(
+            positions.unmatched.len(),
+            usize::from(found.is_none()),
+            "{spelling}"
+        );
     }
 }
 
@@ -147,7 +155,10 @@ fn damaged_rows_are_named_by_line() {
         ("file,lat,lon\na.jpg,1\n", "2 fields"),
         ("file,lat,lon\n,1,2\n", "file is empty"),
         ("file,captured_at\na.jpg,yesterday\n", "RFC 3339"),
-        ("file,captured_at\na.jpg,9999-12-31T23:00:00-02:00\n", "9999"),
+        (
+            "file,captured_at\na.jpg,9999-12-31T23:00:00-02:00\n",
+            "9999",
+        ),
         ("file,latitude\na.jpg,1\n", "latitude"),
         ("lat,lon\n1,2\n", "\"file\""),
         ("file,lattitude,longtitude\na.jpg,1,2\n", "no column"),

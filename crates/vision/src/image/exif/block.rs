@@ -81,7 +81,9 @@ impl<'a> Blocks<'a> {
             let (chunk, after) = rest.get(8..)?.split_at_checked(length as usize)?;
             match &rest[4..8] {
                 b"eXIf" => self.add_exif(chunk),
-                b"iTXt" => xmp_in_text(chunk).into_iter().for_each(|xmp| self.add_xmp(xmp)),
+                b"iTXt" => xmp_in_text(chunk)
+                    .into_iter()
+                    .for_each(|xmp| self.add_xmp(xmp)),
                 b"IEND" => return None,
                 _ => {}
             }

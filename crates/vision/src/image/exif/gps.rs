@@ -127,7 +127,9 @@ fn had_fix(gps: &Directory<'_>) -> bool {
     first_letter(gps, STATUS) == Some('A')
         || matches!(first_letter(gps, MEASURE_MODE), Some('2' | '3'))
         || precision.is_some_and(|precision| precision.is_finite() && precision > 0.0)
-        || gps.field(SATELLITES).is_some_and(|field| field.text().is_some())
+        || gps
+            .field(SATELLITES)
+            .is_some_and(|field| field.text().is_some())
 }
 
 fn angle(

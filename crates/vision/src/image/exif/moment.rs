@@ -33,9 +33,7 @@ impl Moment {
         let exact = |at| Self { at, local: None };
         let of_sound_clock = sound_clock.and_then(Clock::instant).map(exact);
         let of_gps = gps.map(exact);
-        of_sound_clock
-            .or(of_gps)
-            .or_else(|| Self::of_clock(clock?))
+        of_sound_clock.or(of_gps).or_else(|| Self::of_clock(clock?))
     }
 
     fn of_clock(clock: Clock) -> Option<Self> {

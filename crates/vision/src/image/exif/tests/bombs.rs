@@ -18,14 +18,25 @@ fn entry(order: Order, tag: u16, kind: u16, count: u32, value: u32) -> Vec<u8> {
 /// A block whose first directory has these entries, and `tail` behind them.
 fn block(order: Order, entries: &[Vec<u8>], tail: &[u8]) -> Vec<u8> {
     let count = order.u16(entries.len() as u16).to_vec();
-    [order.header(), count, entries.concat(), vec![0; 4], tail.to_vec()].concat()
+    [
+        order.header(),
+        count,
+        entries.concat(),
+        vec![0; 4],
+        tail.to_vec(),
+    ]
+    .concat()
 }
 
 /// Checks that nothing is read from `block` in any container; says so of each.
 fn assert_silent(block: &[u8], what: &str) {
     for container in Container::ALL {
         let bytes = container.with_exif(block);
-        assert_eq!(read_exif(&bytes), ExifInfo::default(), "{what}, {container:?}");
+        assert_eq!(
+            read_exif(&bytes),
+            ExifInfo::default(),
+            "{what}, {container:?}"
+        );
         let upright = Orientation::NoTransforms;
         assert_eq!(orientation(&bytes), upright, "{what}, {container:?}");
     }
@@ -38,7 +49,11 @@ fn sixty_thousand_directories_that_overlap() {
     for order in ORDERS {
         let count = u32::from(u16::MAX);
         let start = 8 + 2 + 12 * count + 4;
-        for (pointer, tail) in [(EXIF_DIRECTORY, 0xff), (GPS_DIRECTORY, 0xff), (0x014a, 0x87)] {
+        for (pointer, tail) in [
+            (EXIF_DIRECTORY, 0xff),
+            (GPS_DIRECTORY, 0xff),
+            (0x014a, 0x87),
+        ] {
             let entries: Vec<Vec<u8>> = (0..count)
                 .map(|index| entry(order, pointer, 4, 1, start + index))
                 .collect();
@@ -78,7 +93,12 @@ fn entries_behind_the_limit_do_not_count() {
 #[test]
 fn offsets_and_counts_beyond_the_block() {
     for order in ORDERS {
-        for (kind, count) in [(2, u32::MAX), (5, u32::MAX), (12, 0x2000_0001), (3, 0x8000_0000)] {
+        for (kind, count) in [
+            (2, u32::MAX),
+            (5, u32::MAX),
+            (12, 0x2000_0001),
+            (3, 0x8000_0000),
+        ] {
             for value in [0, 8, 0xffff, u32::MAX - 3, u32::MAX] {
                 let entries = [
                     entry(order, ORIENTATION, kind, count, value),

@@ -58,7 +58,10 @@ fn the_reference_gives_the_sign_as_it_does_for_exiftool() {
     ] {
         let exif = at((lat_ref, lat.clone()), (lon_ref, lon.clone()));
         assert_eq!(place(&exif), Some(expected), "{lat_ref} {lon_ref}");
-        let negative = at((lat_ref, thirds([-33, 51, 30])), (lon_ref, thirds([-70, 30, 0])));
+        let negative = at(
+            (lat_ref, thirds([-33, 51, 30])),
+            (lon_ref, thirds([-70, 30, 0])),
+        );
         assert_eq!(place(&negative), Some(expected), "{lat_ref} {lon_ref}");
     }
 }
@@ -70,7 +73,11 @@ fn an_unknown_hemisphere_is_no_position_unless_the_numbers_are_signed() {
     for unknown in ["", "?", " ", "0", "E?"] {
         let exif = |(lat, lon): &(Value, Value)| at((unknown, lat.clone()), ("", lon.clone()));
         assert_eq!(place(&exif(&plain)), None, "{unknown:?}");
-        assert_eq!(place(&exif(&signed)), Some((-33.85833, 70.5)), "{unknown:?}");
+        assert_eq!(
+            place(&exif(&signed)),
+            Some((-33.85833, 70.5)),
+            "{unknown:?}"
+        );
     }
     let missing = |(lat, lon): (Value, Value)| Exif::default().gps(2, lat).gps(4, lon);
     assert_eq!(place(&missing(plain.clone())), None);

@@ -12,7 +12,10 @@ use writer::{Container, Exif, Order, Value, jpeg_of};
 #[test]
 fn every_container_and_both_orders_say_the_same() {
     for order in [Order::Little, Order::Big] {
-        let block = Exif::paris().heading(270.5).time("2026:03:01 14:30:05").write(order);
+        let block = Exif::paris()
+            .heading(270.5)
+            .time("2026:03:01 14:30:05")
+            .write(order);
         for container in Container::ALL {
             let info = read_exif(&container.with_exif(&block));
             let place = info.location.expect("no position");
@@ -91,7 +94,13 @@ fn a_second_block_says_what_the_first_does_not() {
 fn what_is_no_image_is_not_read() {
     let block = Exif::paris().orientation(6).write(Order::Little);
     let riff = [b"RIFF\x00\x00\x00\x00AVI EXIF".as_slice(), &block].concat();
-    for bytes in [block.as_slice(), &riff, b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n"] {
+    for bytes in [
+        block.as_slice(),
+        &riff,
+        b"",
+        b"\xff\xd8",
+        b"\x89PNG\r\n\x1a\n",
+    ] {
         assert_eq!(read_exif(bytes), ExifInfo::default());
         assert_eq!(orientation(bytes), Orientation::NoTransforms);
     }
@@ -105,7 +114,10 @@ fn of_a_file_that_is_cut_off_anywhere_nothing_is_made_up() {
         let complete = read_exif(&whole);
         for length in 0..whole.len() {
             let info = read_exif(&whole[..length]);
-            assert!(info.location.is_none_or(|place| Some(place) == complete.location));
+            assert!(
+                info.location
+                    .is_none_or(|place| Some(place) == complete.location)
+            );
             let _ = orientation(&whole[..length]);
         }
     }

@@ -9,7 +9,10 @@ use time::macros::datetime;
 
 fn time(exif: &Exif) -> Option<OffsetDateTime> {
     let info = exif.read();
-    assert_eq!(info.captured_at.is_some(), info.sources.captured_at.is_some());
+    assert_eq!(
+        info.captured_at.is_some(),
+        info.sources.captured_at.is_some()
+    );
     info.captured_at
 }
 
@@ -71,7 +74,10 @@ fn offsets_and_fractions_are_found_wherever_they_stand() {
 fn without_an_offset_the_receiver_knows_better() {
     let without = local("2026:03:01 14:30:05");
     assert_eq!(time(&without), Some(datetime!(2026-03-01 14:30:05 UTC)));
-    assert_eq!(without.read().local_time, Some(datetime!(2026-03-01 14:30:05)));
+    assert_eq!(
+        without.read().local_time,
+        Some(datetime!(2026-03-01 14:30:05))
+    );
     let both = without.clone().gps_time("2026:03:01", [12, 30, 6]);
     assert_eq!(time(&both), Some(datetime!(2026-03-01 12:30:06 UTC)));
     assert_eq!(both.read().local_time, None);
@@ -85,7 +91,10 @@ fn without_an_offset_the_receiver_knows_better() {
     let fraction = Exif::default()
         .gps_time("2026:03:01", [0, 0, 0])
         .gps(7, Value::Rational(fraction));
-    assert_eq!(time(&fraction), Some(datetime!(2026-03-01 12:30:06.847 UTC)));
+    assert_eq!(
+        time(&fraction),
+        Some(datetime!(2026-03-01 12:30:06.847 UTC))
+    );
 }
 
 #[test]

@@ -70,7 +70,11 @@ fn what_is_no_position_is_none() {
         "xmlns:exif=\"http://ns.adobe.com/exif/1.0/\" other:GPSLatitude=\"48N\" \
          other:GPSLongitude=\"2E\"",
     ] {
-        assert_eq!(read(&attributes(properties)), ExifInfo::default(), "{properties}");
+        assert_eq!(
+            read(&attributes(properties)),
+            ExifInfo::default(),
+            "{properties}"
+        );
     }
 }
 
@@ -92,7 +96,10 @@ fn headings_of_drones_and_panoramas_are_read() {
 fn times_are_read() {
     let time = |properties: &str| read(&attributes(properties)).captured_at;
     let at = datetime!(2026-03-01 12:30:05.847 UTC);
-    assert_eq!(time("exif:DateTimeOriginal=\"2026-03-01T14:30:05.847+02:00\""), Some(at));
+    assert_eq!(
+        time("exif:DateTimeOriginal=\"2026-03-01T14:30:05.847+02:00\""),
+        Some(at)
+    );
     let several = "xmp:CreateDate=\"1999-01-01T00:00:00Z\" \
                    photoshop:DateCreated=\"2026-03-01T14:30:05.847+02:00\"";
     assert_eq!(time(several), Some(at));
@@ -132,7 +139,10 @@ fn hostile_packets_cost_a_walk() {
     let wide = (0..5_000).map(|index| format!("a{}=\"\" ", index % 7));
     let wide = format!("<rdf:Description {} {facts}/>", wide.collect::<String>());
     assert_eq!(place(&attributes(facts)), Some((48.0, 2.0)));
-    assert_eq!(place(&format!("{entities}{}", attributes(facts))), Some((48.0, 2.0)));
+    assert_eq!(
+        place(&format!("{entities}{}", attributes(facts))),
+        Some((48.0, 2.0))
+    );
     assert_eq!(place(&wide), Some((48.0, 2.0)));
     assert_eq!(place(&deep), None);
     // Padding before the facts hides them in a file that can hold so much.
@@ -143,7 +153,9 @@ fn hostile_packets_cost_a_walk() {
     // A compressed text is passed over.
     let mut compressed = Container::Png.with_xmp(&attributes(facts));
     let keyword = b"XML:com.adobe.xmp\0";
-    let at = compressed.windows(keyword.len()).position(|part| part == keyword);
+    let at = compressed
+        .windows(keyword.len())
+        .position(|part| part == keyword);
     compressed[at.unwrap() + keyword.len()] = 1;
     assert_eq!(read_exif(&compressed), ExifInfo::default());
 }
