@@ -45,7 +45,7 @@ pub(super) struct PhotoRecord {
     /// Which fields of the reference were changed.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(super) changed: Vec<&'static str>,
-    /// What is wrong with the position in its name, which was imported all the same.
+    /// What is wrong with the position in its name; the photo was imported all the same.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) warning: Option<String>,
     /// Why it failed or was ignored: a code of the error table or one of the import's own.
@@ -141,7 +141,7 @@ pub(super) struct Summary {
     pub(super) failed: usize,
     /// No photos that can be imported.
     pub(super) ignored: usize,
-    /// Photos whose name carries a position that is wrong.
+    /// Photos whose name carries a doubtful position.
     pub(super) warned: usize,
     /// Of those created, how many have no position.
     pub(super) without_position: usize,
@@ -183,7 +183,7 @@ impl fmt::Display for Summary {
             )?;
         }
         if self.warned > 0 {
-            write!(f, "; {} names carry a wrong position", self.warned)?;
+            write!(f, "; {} names carry a doubtful position", self.warned)?;
         }
         Ok(())
     }

@@ -366,9 +366,11 @@ mod tests {
         let a = reference("\"a\"", "1", location);
         let nameless = reference("null", "3", "");
         let b = reference("\"b\"", "2", ",\"location\":null,\"captured_at\":null");
+        let first = format!("200 OK|{{\"references\":[{a},{nameless}],\"next\":\"n1\"}}");
+        let last = format!("200 OK|{{\"references\":[{b}],\"next\":null}}");
         let (url, requests) = server(vec![
-            format!("200 OK|{{\"references\":[{a},{nameless}],\"next\":\"n1\"}}").leak(),
-            format!("200 OK|{{\"references\":[{b}],\"next\":null}}").leak(),
+            &*first.leak(),
+            &*last.leak(),
             "404 No|{\"code\":\"map_not_found\",\"retryable\":false}",
             "200 OK|{\"references\":[{\"id\":\"x\"}],\"next\":null}",
         ]);

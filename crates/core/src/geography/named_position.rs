@@ -152,7 +152,7 @@ mod tests {
             ("@0261878@6243186@34@T@.jpg", None, "not in band 34T"),
             ("@500000@5000000@.jpg", None, "no UTM zone"),
             ("@500000@5000000@61@T@.jpg", Some("33T"), "no UTM zone 61T"),
-            ("@500000@5000000@.jpg", Some("33S"), "not in band 33S"),
+            ("@500000@6000000@.jpg", Some("33S"), "not in band 33S"),
             ("@500000@-5@33@T@.jpg", None, "no coordinates"),
         ] {
             let found = position(name, zone);

@@ -78,7 +78,7 @@ struct Run<'a> {
 }
 
 impl<'a> Run<'a> {
-    fn into(sink: &'a Memory) -> Self {
+    fn new(sink: &'a Memory) -> Self {
         Self {
             sink,
             metadata: Metadata::default(),
@@ -94,7 +94,7 @@ impl<'a> Run<'a> {
         self
     }
 
-    /// Imports, with what the map has and without knowing it; says the same both times.
+    /// Imports, knowing what the map has.
     fn import(&self, folder: &Path, report: &Path) -> (Summary, Option<String>) {
         let present = self.sink.present(&"m".parse().unwrap()).unwrap();
         self.import_knowing(present, folder, report)
@@ -147,12 +147,12 @@ fn a_second_import_skips_what_is_there_and_reports_what_changed() {
     std::fs::write(photos.join("bad.jpg"), b"!image_undecodable").unwrap();
     let sink = Memory::default();
     let report = folder.path().join("report.jsonl");
-    let (summary, stopped) = Run::into(&sink).import(&photos, &report);
+    let (summary, stopped) = Run::new(&sink).import(&photos, &report);
     assert_eq!((summary.created, summary.failed, stopped), (3, 1, None));
     std::fs::write(photos.join("b.jpg"), "other").unwrap();
     std::fs::remove_file(photos.join("bad.jpg")).unwrap();
     std::fs::write(photos.join("d.jpg"), "new").unwrap();
-    let (summary, _) = Run::into(&sink).import(&photos, &report);
+    let (summary, _) = Run::new(&sink).import(&photos, &report);
     assert_eq!(
         (summary.created, summary.skipped, summary.failed),
         (1, 2, 1)
@@ -175,7 +175,7 @@ fn what_holds_for_every_image_stops_the_import() {
     }
     let report = folder.path().join("report.jsonl");
     let sink = Memory::default();
-    let (summary, stopped) = Run::into(&sink).import(folder.path(), &report);
+    let (summary, stopped) = Run::new(&sink).import(folder.path(), &report);
     assert!(
         summary.failed <= 3 && stopped.is_some(),
         "{summary} {stopped:?}"
@@ -193,12 +193,12 @@ fn positions_arrive_later_and_nothing_replaces_them_but_positions() {
         let there = summary.skipped + summary.present;
         (summary.created, summary.updated, there, summary.failed)
     };
-    let (summary, _) = Run::into(&sink).import(&photos, &report);
+    let (summary, _) = Run::new(&sink).import(&photos, &report);
     assert_eq!(counts(summary), (2, 0, 0, 0));
     let from_name = sink.get(named).location.unwrap();
 
     let csv = format!("file,lat,lon,captured_at\na.jpg,1,2,2026-05-17T09:30:00Z\n{named},3,4,\n");
-    let with_positions = Run::into(&sink).with_positions(&photos, &csv);
+    let with_positions = Run::new(&sink).with_positions(&photos, &csv);
     let (summary, _) = with_positions.import(&photos, &report);
     assert_eq!(counts(summary), (0, 2, 0, 0));
     assert_eq!(sink.get("a.jpg").location, GeoPoint::new(1.0, 2.0).ok());
@@ -214,13 +214,13 @@ fn positions_arrive_later_and_nothing_replaces_them_but_positions() {
     // Again, with and without the table: nothing changes.
     let (summary, _) = with_positions.import(&photos, &report);
     assert_eq!(counts(summary), (0, 0, 2, 0));
-    let (summary, _) = Run::into(&sink).import(&photos, &report);
+    let (summary, _) = Run::new(&sink).import(&photos, &report);
     assert_eq!(counts(summary), (0, 0, 2, 0));
     assert_eq!(sink.get(named).location, GeoPoint::new(3.0, 4.0).ok());
 
     // The map knows the photos, although the listing did not show them.
     let csv = "file,lat,lon\na.jpg,5,6\n";
-    let other_positions = Run::into(&sink).with_positions(&photos, csv);
+    let other_positions = Run::new(&sink).with_positions(&photos, csv);
     let (summary, _) = other_positions.import_knowing(HashMap::new(), &photos, &report);
     assert_eq!(counts(summary), (0, 1, 1, 0));
     assert_eq!(sink.get("a.jpg").location, GeoPoint::new(5.0, 6.0).ok());
@@ -243,14 +243,14 @@ fn a_required_position_may_be_the_maps() {
     };
     let csv = "file,lat,lon\na.jpg,1,2\n";
     assert_eq!(
-        require(Run::into(&sink).with_positions(&photos, csv)),
+        require(Run::new(&sink).with_positions(&photos, csv)),
         (1, 0, 1)
     );
     let failed = lines(&report);
     let failed = failed.iter().find(|line| line["status"] == "failed");
     let detail = failed.unwrap()["detail"].to_string();
     assert!(detail.contains("no UTM coordinates"), "{detail}");
-    assert_eq!(require(Run::into(&sink)), (0, 1, 1));
-    let (summary, _) = Run::into(&sink).import(&photos, &report);
+    assert_eq!(require(Run::new(&sink)), (0, 1, 1));
+    let (summary, _) = Run::new(&sink).import(&photos, &report);
     assert_eq!((summary.created, summary.warned), (1, 1));
 }

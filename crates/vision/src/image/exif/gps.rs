@@ -124,12 +124,12 @@ fn location(gps: &Directory<'_>) -> Option<GeoPoint> {
 /// Whether the receiver says that its position was measured.
 fn had_fix(gps: &Directory<'_>) -> bool {
     let precision = gps.field(PRECISION).and_then(|field| field.number(0));
+    let satellites = gps.field(SATELLITES).and_then(|field| field.text());
     first_letter(gps, STATUS) == Some('A')
         || matches!(first_letter(gps, MEASURE_MODE), Some('2' | '3'))
         || precision.is_some_and(|precision| precision.is_finite() && precision > 0.0)
-        || gps
-            .field(SATELLITES)
-            .is_some_and(|field| field.text().is_some())
+        // A count or a list of their numbers.
+        || satellites.is_some_and(|satellites| satellites.contains(|c| ('1'..='9').contains(&c)))
 }
 
 fn angle(

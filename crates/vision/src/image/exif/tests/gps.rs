@@ -104,8 +104,14 @@ fn zero_is_a_place_only_if_something_says_so() {
         let fixed = null_island.clone().gps(tag, value);
         assert_eq!(place(&fixed), Some((0.0, 0.0)), "{tag}");
     }
-    let unmeasured = null_island.gps(11, Value::Rational(vec![(0, 0)]));
-    assert_eq!(place(&unmeasured), None);
+    for (tag, value) in [
+        (11, Value::Rational(vec![(0, 0)])),
+        (8, Value::Text("00")),
+        (10, Value::Text("0")),
+    ] {
+        let unmeasured = null_island.clone().gps(tag, value);
+        assert_eq!(place(&unmeasured), None, "{tag}");
+    }
 }
 
 #[test]
