@@ -201,6 +201,42 @@ def exif_webp(orientation, picture):
     return b"RIFF" + struct.pack("<I", len(body)) + body
 
 
+def exif_seeds():
+    def text(tag, value):
+        return tag, 2, len(value) + 1, value + b"\0"
+
+    def directory(at, entries):
+        head, tail = struct.pack("<H", len(entries)), b""
+        values_at = at + 2 + 12 * len(entries) + 4
+        for tag, kind, count, data in entries:
+            field = data.ljust(4, b"\0") if len(data) <= 4 else struct.pack("<I", values_at + len(tail))
+            head += struct.pack("<HHI", tag, kind, count) + field
+            tail += data if len(data) > 4 else b""
+        return head + bytes(4) + tail
+
+    gps = [
+        text(1, b"N"), (2, 5, 3, struct.pack("<6I", 48, 1, 51, 1, 30, 1)),
+        text(3, b"W"), (4, 10, 3, struct.pack("<6i", 2, 1, 17, 1, 40, 1)),
+        (7, 5, 3, struct.pack("<6I", 12, 1, 30, 1, 5, 1)), text(9, b"A"),
+        (17, 12, 1, struct.pack("<d", 270.5)), text(29, b"2026:03:01"),
+    ]
+    exif = [text(0x9003, b"2026:03:01 14:30:05.847+02:00"), text(0x9011, b"+02:00"), text(0x9291, b"847")]
+    exif_at = 8 + 2 + 12 * 3 + 4
+    gps_at = exif_at + len(directory(exif_at, exif))
+    first = [
+        (0x0112, 3, 1, b"\x06\0"), (0x8769, 4, 1, struct.pack("<I", exif_at)),
+        (0x8825, 4, 1, struct.pack("<I", gps_at)),
+    ]
+    whole = b"II*\0\x08\0\0\0" + directory(8, first) + directory(exif_at, exif) + directory(gps_at, gps)
+    xmp = (
+        b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description exif:GPSLatitude="48,51.5N" '
+        b'exif:GPSLongitude="2,17.67E" drone-dji:GimbalYawDegree="-90.5"><xmp:CreateDate>'
+        b"2026-03-01T14:30:05+02:00</xmp:CreateDate></rdf:Description></rdf:RDF></x:xmpmeta>"
+    )
+    circle = b"II*\0\x08\0\0\0" + directory(8, [(0x8769, 4, 1, b"\x08\0\0\0"), (0x8825, 4, 1, b"\x08\0\0\0")])
+    return {"whole": whole, "cut_off": whole[:-40], "circle": circle, "xmp": xmp, "xmp_cut_off": xmp[:120]}
+
+
 def image_seeds():
     seeds = {
         "jpeg": JPEG,
@@ -321,6 +357,7 @@ def numbered(texts):
 def main():
     corpora = {
         "image": image_seeds(),
+        "exif": exif_seeds(),
         "patch_blob": patch_seeds(),
         "multipart": multipart_seeds(),
         "query_options": numbered(QUERY_SEEDS),

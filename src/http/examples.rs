@@ -142,6 +142,17 @@ pub(super) fn reference() -> Value {
     })
 }
 
+/// A reference that was just stored: it was sent with a position, and its photo knew the time.
+pub(super) fn created_reference() -> Value {
+    let mut created = reference();
+    created["sources"] = json!({
+        "location": "request",
+        "heading": "request",
+        "captured_at": "exif",
+    });
+    created
+}
+
 /// A page of a listing.
 pub(super) fn reference_page() -> Value {
     json!({"references": [reference()], "next": "at-1204"})

@@ -10,6 +10,7 @@ use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{ContentHash, MapName, NewReference, Reference, ReferenceFields};
 use placeformer_store::Inserted;
+use placeformer_vision::image::{ExifInfo, MetadataBlock, read_exif};
 use placeformer_vision::search::IndexEntry;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -23,6 +24,74 @@ pub struct IngestRequest {
     pub fields: ReferenceFields,
     /// The photo, as it was sent.
     pub image: Bytes,
+    /// Whether position, heading and time are taken from the photo's EXIF and XMP where `fields`
+    /// has none.
+    pub reads_photo: bool,
+}
+
+/// Where a field of a reference comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FieldSource {
+    /// The map builder said it with this request.
+    Request,
+    /// The photo's EXIF.
+    Exif,
+    /// The photo's XMP.
+    Xmp,
+    /// The reference was there before, and the field as it is.
+    Stored,
+}
+
+/// Where the fields of a reference come from; `None` where it has no value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct FieldSources {
+    /// The location.
+    pub location: Option<FieldSource>,
+    /// The heading.
+    pub heading: Option<FieldSource>,
+    /// The time.
+    pub captured_at: Option<FieldSource>,
+}
+
+impl FieldSources {
+    /// The sources of a reference that was there before.
+    fn stored(fields: &ReferenceFields) -> Self {
+        Self {
+            location: fields.location.map(|_| FieldSource::Stored),
+            heading: fields.heading.map(|_| FieldSource::Stored),
+            captured_at: fields.captured_at.map(|_| FieldSource::Stored),
+        }
+    }
+
+    /// Fills the gaps of what a request says with what the photo says.
+    fn complete(fields: &mut ReferenceFields, photo: &ExifInfo) -> Self {
+        let sources = photo.sources;
+        Self {
+            location: fill(&mut fields.location, photo.location, sources.location),
+            heading: fill(&mut fields.heading, photo.heading, sources.heading),
+            captured_at: fill(
+                &mut fields.captured_at,
+                photo.captured_at,
+                sources.captured_at,
+            ),
+        }
+    }
+}
+
+/// Takes `photo` where `field` has no value; says where the value comes from.
+fn fill<T>(
+    field: &mut Option<T>,
+    photo: Option<T>,
+    block: Option<MetadataBlock>,
+) -> Option<FieldSource> {
+    if field.is_some() {
+        return Some(FieldSource::Request);
+    }
+    *field = photo;
+    block.map(|block| match block {
+        MetadataBlock::Exif => FieldSource::Exif,
+        MetadataBlock::Xmp => FieldSource::Xmp,
+    })
 }
 
 /// A reference that is durable and can be found.
@@ -32,6 +101,8 @@ pub struct IngestAnswer {
     pub reference: Reference,
     /// False if the same external id with the same content was there before.
     pub created: bool,
+    /// Where its fields come from.
+    pub sources: FieldSources,
     /// Where the time went.
     pub timings: Timings,
 }
@@ -59,14 +130,18 @@ impl Service {
         }
         let ticket = Arc::new(self.references.admit(caller, Duration::MAX)?);
 
-        let content_hash = self.hash(request.image.clone(), &ticket).await?;
+        let (content_hash, photo) = self.look_at(&request, &ticket).await?;
         if let Some(reference) = self.already_stored(caller, &request, content_hash).await? {
+            let sources = FieldSources::stored(&reference.fields);
             return Ok(IngestAnswer {
                 reference,
                 created: false,
+                sources,
                 timings: Timings::default(),
             });
         }
+        let mut fields = request.fields;
+        let sources = FieldSources::complete(&mut fields, &photo);
 
         let mut timings = Timings::default();
         let descriptor = self
@@ -75,7 +150,7 @@ impl Service {
             .await?;
         let new = NewReference {
             map: request.map,
-            fields: request.fields,
+            fields,
             content_hash,
             model,
             descriptor,
@@ -83,23 +158,40 @@ impl Service {
         let started = Instant::now();
         let committed = self.commit(new, ticket).await;
         timings.record(&self.metrics, PipelineStage::Commit, started.elapsed());
-        let (reference, created) = match committed? {
-            Inserted::Created(reference) => (reference, true),
-            Inserted::AlreadyThere(reference) => (reference, false),
+        let (reference, created, sources) = match committed? {
+            Inserted::Created(reference) => (reference, true, sources),
+            Inserted::AlreadyThere(reference) => {
+                let sources = FieldSources::stored(&reference.fields);
+                (reference, false, sources)
+            }
         };
         Ok(IngestAnswer {
             reference,
             created,
+            sources,
             timings,
         })
     }
 
-    async fn hash(&self, image: Bytes, ticket: &Arc<Ticket>) -> Result<ContentHash, PipelineError> {
-        let hashed = self
-            .extraction
-            .on_decoder_thread(ticket, move || ContentHash::of(&image))
-            .await;
-        hashed.map_err(|_| PipelineError::Panicked { stage: "hashing" })
+    /// The hash of the photo, and what it says about itself, if that is asked for. Both are a walk
+    /// over its bytes.
+    async fn look_at(
+        &self,
+        request: &IngestRequest,
+        ticket: &Arc<Ticket>,
+    ) -> Result<(ContentHash, ExifInfo), PipelineError> {
+        let image = request.image.clone();
+        let reads_photo = request.reads_photo;
+        let work = move || {
+            let photo = if reads_photo {
+                read_exif(&image)
+            } else {
+                ExifInfo::default()
+            };
+            (ContentHash::of(&image), photo)
+        };
+        let seen = self.extraction.on_decoder_thread(ticket, work).await;
+        seen.map_err(|_| PipelineError::Panicked { stage: "hashing" })
     }
 
     /// The reference that this request repeats, found before anything costly is done. None if there

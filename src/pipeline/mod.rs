@@ -47,7 +47,7 @@ pub use calibrations::MatchConfidence;
 pub use caller::{Caller, network_of};
 pub use config::PipelineConfig;
 pub use error::PipelineError;
-pub use ingest::{IngestAnswer, IngestRequest};
+pub use ingest::{FieldSource, FieldSources, IngestAnswer, IngestRequest};
 pub use match_images::{MatchAnswer, MatchTarget, MatchedPair};
 pub use query::{QueryAnswer, QueryOptions, QueryRequest, QueryResult};
 pub use service::{Service, ServiceInfo};

@@ -5,6 +5,7 @@ mod common;
 
 mod commands;
 mod eval;
+mod import;
 mod own_weights;
 mod serve;
 mod streams;

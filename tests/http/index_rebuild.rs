@@ -225,6 +225,7 @@ impl History {
             map: map.clone(),
             fields: fields.clone(),
             image,
+            reads_photo: true,
         };
         let answer = self
             .runtime

@@ -24,6 +24,7 @@ mod listener;
 mod logs;
 mod lost_storage;
 mod off_thread;
+mod photo_metadata;
 mod process;
 mod rehead;
 mod routes;

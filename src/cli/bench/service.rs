@@ -69,6 +69,7 @@ impl MeasuredService for RunningPipeline {
                 map: map.clone(),
                 fields: ReferenceFields::default(),
                 image,
+                reads_photo: false,
             };
             self.service.ingest(&Caller::Local, request).await
         };

@@ -1,11 +1,14 @@
 //! The import itself: several threads take photos from one list and hand them to the sink.
 
-use super::metadata::Metadata;
+use super::metadata::{Metadata, PhotoFacts};
+use super::photo_file;
 use super::report::{ImportReport, PhotoRecord, Status};
-use super::sink::{self, Outcome, Sink, Upload};
+use super::sink::{self, Outcome, Sink, Stored, Upload};
 use crate::cli::output::note;
+use placeformer_core::printable::Printable;
 use placeformer_core::progress::{Progress, Task};
-use placeformer_core::types::{ContentHash, ExternalId, MapName};
+use placeformer_core::types::{ContentHash, ExternalId, GeoPoint, MapName};
+use placeformer_store::ReferencePatch;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -16,8 +19,12 @@ pub(super) struct Importer<'a> {
     pub(super) sink: &'a dyn Sink,
     pub(super) metadata: &'a Metadata,
     pub(super) map: &'a MapName,
-    /// What the map has already: the hash of the content by external id.
-    pub(super) present: &'a HashMap<String, String>,
+    /// What the map has already, by external id.
+    pub(super) present: &'a HashMap<String, Stored>,
+    /// Whether photos for which no position is known are refused.
+    pub(super) requires_position: bool,
+    /// Names shown so far to be wrong.
+    pub(super) warnings: AtomicUsize,
     pub(super) report: &'a ImportReport,
     pub(super) progress: &'a dyn Progress,
 }
@@ -47,7 +54,7 @@ impl<'a> Queue<'a> {
 }
 
 /// A photo that did not get into the map.
-struct Failure {
+pub(super) struct Failure {
     /// A code of the error table or one of the import's own.
     code: String,
     detail: String,
@@ -55,12 +62,32 @@ struct Failure {
 }
 
 impl Failure {
-    fn unsent(code: &str, detail: impl Into<String>) -> Self {
+    pub(super) fn unsent(code: &str, detail: impl Into<String>) -> Self {
         Self {
             code: code.to_owned(),
             detail: detail.into(),
             attempts: 0,
         }
+    }
+
+    #[cfg(test)]
+    pub(super) fn code(&self) -> &str {
+        &self.code
+    }
+
+    fn unexpected(attempts: u32) -> Self {
+        Self {
+            attempts,
+            ..Self::unsent("unexpected_answer", "the answer belongs to another request")
+        }
+    }
+
+    /// Adds what is wrong with the photo's name, which may be why it failed.
+    fn with_doubt(mut self, doubt: Option<&str>) -> Self {
+        if let Some(doubt) = doubt.filter(|_| self.code == "no_position") {
+            self.detail = format!("{}; the name: {doubt}", self.detail);
+        }
+        self
     }
 }
 
@@ -102,38 +129,75 @@ impl Importer<'_> {
             detail,
             attempts,
         } = failure;
-        self.progress.suspend(&mut || note!("{name}: {detail}"));
+        self.show(name, &detail);
         if sink::is_hopeless(&code) {
             queue.stop(detail.clone());
         }
         PhotoRecord::failed(name, &code, detail, attempts)
     }
 
-    /// Imports one photo, or skips it if the map has it.
+    fn show(&self, name: &str, detail: &str) {
+        let line = format!("{name}: {detail}");
+        let shown = Printable(line);
+        self.progress.suspend(&mut || eprintln!("{shown}"));
+    }
+
+    /// Imports one photo, or brings up to date what the map knows about it.
     fn import(&self, name: &str, path: &Path) -> Result<PhotoRecord, Failure> {
         let external_id: ExternalId = name
             .parse()
             .map_err(|error| Failure::unsent("invalid_parameter", format!("{error}")))?;
-        let image = std::fs::read(path)
-            .map_err(|error| Failure::unsent("unreadable_file", error.to_string()))?;
-        if let Some(present) = self.present.get(name) {
-            return skip(name, present, &image);
+        let image = photo_file::read(path)?;
+        let facts = self.metadata.facts(name, external_id, &image);
+        let doubt = facts.doubt.clone();
+        let record = match self.present.get(name) {
+            Some(stored) if stored.content != ContentHash::of(&image) => Err(conflict()),
+            Some(stored) => self.refresh(name, stored, &facts, 0),
+            None => self.send(name, facts, image),
+        };
+        let record = record.map_err(|failure| failure.with_doubt(doubt.as_deref()))?;
+        if let Some(doubt) = &doubt {
+            self.warn(name, doubt);
         }
-        let fields = self
-            .metadata
-            .fields(name, external_id, &image)
-            .map_err(|detail| Failure::unsent("no_position", detail))?;
-        let located = fields.location.is_some();
+        Ok(PhotoRecord {
+            warning: doubt,
+            ..record
+        })
+    }
+
+    /// Shows what is wrong with a name. If it is wrong with many, the report says so of the others.
+    fn warn(&self, name: &str, doubt: &str) {
+        const SHOWN: usize = 10;
+        match self.warnings.fetch_add(1, Ordering::Relaxed) {
+            before if before < SHOWN => self.show(name, &format!("warning: {doubt}")),
+            SHOWN => self.show("warning", "more names are wrong; --report has them all"),
+            _ => {}
+        }
+    }
+
+    fn send(&self, name: &str, facts: PhotoFacts, image: Vec<u8>) -> Result<PhotoRecord, Failure> {
+        self.check_position(facts.fields.location)?;
+        let located = facts.fields.location.is_some();
         let sent = self.sink.send(Upload {
             map: self.map.clone(),
-            fields,
+            fields: facts.fields.clone(),
             image: image.into(),
         });
         let attempts = sent.attempts;
-        let stored = |status, id| PhotoRecord::stored(name, status, id, located, attempts);
         match sent.outcome {
-            Outcome::Created(id) => Ok(stored(Status::Created, id)),
-            Outcome::Present(id) => Ok(stored(Status::Present, id)),
+            Outcome::Created(id) => {
+                let status = Status::Created;
+                Ok(PhotoRecord::stored(name, status, id, located, attempts))
+            }
+            Outcome::Present(stored) => {
+                let record = self.refresh(name, &stored, &facts, attempts)?;
+                let is_unchanged = record.status == Status::Skipped;
+                let id = stored.id.to_string();
+                let located = stored.location.is_some();
+                let present = PhotoRecord::stored(name, Status::Present, id, located, attempts);
+                Ok(if is_unchanged { present } else { record })
+            }
+            Outcome::Updated => Err(Failure::unexpected(attempts)),
             Outcome::Refused { code, detail } => Err(Failure {
                 code,
                 detail,
@@ -141,125 +205,95 @@ impl Importer<'_> {
             }),
         }
     }
+
+    /// Sends what this import knows better than the map about a photo that is there.
+    fn refresh(
+        &self,
+        name: &str,
+        stored: &Stored,
+        facts: &PhotoFacts,
+        attempts: u32,
+    ) -> Result<PhotoRecord, Failure> {
+        self.check_position(facts.fields.location.or(stored.location))?;
+        let (patch, changed) = difference(stored, facts);
+        if changed.is_empty() {
+            return Ok(PhotoRecord::skipped(name, attempts));
+        }
+        let sent = self.sink.update(stored.id, patch);
+        let attempts = attempts + sent.attempts;
+        match sent.outcome {
+            Outcome::Updated => {
+                let id = stored.id.to_string();
+                Ok(PhotoRecord::updated(name, id, changed, attempts))
+            }
+            Outcome::Refused { code, detail } => Err(Failure {
+                code,
+                detail: format!("the map holds it, but it could not be updated: {detail}"),
+                attempts,
+            }),
+            Outcome::Created(_) | Outcome::Present(_) => Err(Failure::unexpected(attempts)),
+        }
+    }
+
+    fn check_position(&self, location: Option<GeoPoint>) -> Result<(), Failure> {
+        if self.requires_position && location.is_none() {
+            let detail = "no position in the positions file, the name or the photo itself";
+            return Err(Failure::unsent("no_position", detail));
+        }
+        Ok(())
+    }
 }
 
-/// The record of a photo whose name the map knows with content of the hash `present`.
-fn skip(name: &str, present: &str, image: &[u8]) -> Result<PhotoRecord, Failure> {
-    if present == ContentHash::of(image).to_string() {
-        return Ok(PhotoRecord::skipped(name));
-    }
+fn conflict() -> Failure {
     let detail = "the map holds another image under this name; delete it there or rename this one";
-    Err(Failure::unsent("external_id_conflict", detail))
+    Failure::unsent("external_id_conflict", detail)
+}
+
+/// What to change of a reference, and the names of those fields. A value replaces another only if
+/// it was given to this import; nothing is ever cleared.
+fn difference(stored: &Stored, facts: &PhotoFacts) -> (ReferencePatch, Vec<&'static str>) {
+    let PhotoFacts { fields, given, .. } = facts;
+    let location = better(
+        fields.location,
+        stored.location,
+        given.location,
+        PartialEq::eq,
+    );
+    let heading = better(fields.heading, stored.heading, given.heading, PartialEq::eq);
+    let captured_at = better(
+        fields.captured_at,
+        stored.captured_at,
+        given.captured_at,
+        PartialEq::eq,
+    );
+    let names = [
+        ("location", location.is_some()),
+        ("heading", heading.is_some()),
+        ("captured_at", captured_at.is_some()),
+    ];
+    let changed = names.into_iter().filter(|(_, is_changed)| *is_changed);
+    let patch = ReferencePatch {
+        location: location.map(Some),
+        heading: heading.map(Some),
+        captured_at: captured_at.map(Some),
+        ..ReferencePatch::default()
+    };
+    (patch, changed.map(|(name, _)| name).collect())
+}
+
+/// The value known now, if it should take the place of the stored one.
+fn better<T>(
+    known: Option<T>,
+    stored: Option<T>,
+    is_given: bool,
+    is_same: fn(&T, &T) -> bool,
+) -> Option<T> {
+    let known = known?;
+    match stored {
+        None => Some(known),
+        Some(stored) => (is_given && !is_same(&known, &stored)).then_some(known),
+    }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::report::Summary;
-    use super::super::sink::Sent;
-    use super::*;
-    use placeformer_core::folder::list_images;
-    use placeformer_core::progress::Silent;
-    use std::sync::Mutex;
-
-    /// Keeps what it is sent; refuses images that start with `!`, with the code that follows.
-    #[derive(Default)]
-    struct Memory(Mutex<HashMap<String, String>>);
-
-    impl Sink for Memory {
-        fn present(&self, _map: &MapName) -> anyhow::Result<HashMap<String, String>> {
-            Ok(self.0.lock().unwrap().clone())
-        }
-
-        fn send(&self, upload: Upload) -> Sent {
-            if let Some(code) = upload.image.strip_prefix(b"!") {
-                let code = String::from_utf8_lossy(code).into_owned();
-                return Sent {
-                    outcome: Outcome::Refused {
-                        code,
-                        detail: "refused".into(),
-                    },
-                    attempts: 1,
-                };
-            }
-            let id = upload.fields.external_id.unwrap().to_string();
-            self.0
-                .lock()
-                .unwrap()
-                .insert(id, ContentHash::of(&upload.image).to_string());
-            Sent {
-                outcome: Outcome::Created("id".into()),
-                attempts: 1,
-            }
-        }
-    }
-
-    fn import(folder: &Path, sink: &Memory, path: &Path) -> (Summary, Option<String>) {
-        let images = list_images(folder).unwrap();
-        let metadata = Metadata::read(None, Path::new("."), None, false).unwrap();
-        let map = "m".parse().unwrap();
-        let present = sink.present(&map).unwrap();
-        let report = ImportReport::create(Some(path)).unwrap();
-        let importer = Importer {
-            sink,
-            metadata: &metadata,
-            map: &map,
-            present: &present,
-            report: &report,
-            progress: &Silent,
-        };
-        let stopped = importer.run(&images, 3);
-        (report.finish().unwrap(), stopped)
-    }
-
-    #[test]
-    fn a_second_import_skips_what_is_there_and_reports_what_changed() {
-        let folder = tempfile::tempdir().unwrap();
-        let photos = folder.path().join("photos");
-        std::fs::create_dir_all(photos.join("sub")).unwrap();
-        for name in ["a.jpg", "b.jpg", "sub/c.png"] {
-            std::fs::write(photos.join(name), name).unwrap();
-        }
-        std::fs::write(photos.join("bad.jpg"), b"!image_undecodable").unwrap();
-        let sink = Memory::default();
-        let report = folder.path().join("report.jsonl");
-        let (summary, stopped) = import(&photos, &sink, &report);
-        assert_eq!((summary.created, summary.failed, stopped), (3, 1, None));
-        std::fs::write(photos.join("b.jpg"), "other").unwrap();
-        std::fs::remove_file(photos.join("bad.jpg")).unwrap();
-        std::fs::write(photos.join("d.jpg"), "new").unwrap();
-        let (summary, _) = import(&photos, &sink, &report);
-        assert_eq!(
-            (summary.created, summary.skipped, summary.failed),
-            (1, 2, 1)
-        );
-        let lines: Vec<serde_json::Value> = std::fs::read_to_string(&report)
-            .unwrap()
-            .lines()
-            .map(|line| serde_json::from_str(line).unwrap())
-            .collect();
-        assert_eq!(lines.len(), 4);
-        let changed = lines.iter().find(|line| line["file"] == "b.jpg").unwrap();
-        assert_eq!(
-            (&changed["status"], &changed["code"]),
-            (&"failed".into(), &"external_id_conflict".into())
-        );
-    }
-
-    #[test]
-    fn what_holds_for_every_image_stops_the_import() {
-        let folder = tempfile::tempdir().unwrap();
-        for i in 0..50 {
-            std::fs::write(
-                folder.path().join(format!("{i:02}.jpg")),
-                b"!model_mismatch",
-            )
-            .unwrap();
-        }
-        let report = folder.path().join("report.jsonl");
-        let (summary, stopped) = import(folder.path(), &Memory::default(), &report);
-        assert!(
-            summary.failed <= 3 && stopped.is_some(),
-            "{summary} {stopped:?}"
-        );
-    }
-}
+mod tests;

@@ -1,14 +1,18 @@
 //! An import through a running server: raw image bodies, sent again while the server is busy, and
 //! never again where the request itself is wrong.
 
-use super::sink::{Outcome, Sent, Sink, Upload};
+use super::sink::{Outcome, Sent, Sink, Stored, Upload};
 use crate::cli::client::{BYTES, ClientError, Connection, ServerArgs, ServerClient};
 use anyhow::Context;
 use placeformer_core::error::ErrorCode;
-use placeformer_core::types::MapName;
+use placeformer_core::types::{
+    ContentHash, GeoPoint, Heading, MapName, ReferenceId, Timestamp,
+};
+use placeformer_store::ReferencePatch;
 use reqwest::header::CONTENT_TYPE;
 use reqwest::{Method, RequestBuilder, StatusCode};
 use serde::Deserialize;
+use serde_json::{Map, Value};
 use std::collections::HashMap;
 
 /// References listed by one request.
@@ -17,6 +21,8 @@ const PAGE: &str = "1000";
 /// A server as a sink.
 pub(super) struct ServerSink {
     client: ServerClient,
+    /// Whether the server is told to leave alone what the photos say about themselves.
+    ignores_exif: bool,
 }
 
 /// One page of a map's references; of each reference what an import compares.
@@ -29,15 +35,49 @@ struct ReferencePage {
 
 #[derive(Deserialize)]
 struct ListedReference {
+    id: ReferenceId,
     external_id: Option<String>,
-    content_sha256: Option<String>,
+    content_sha256: String,
+    location: Option<ListedLocation>,
+    captured_at: Option<Timestamp>,
+}
+
+#[derive(Default, Deserialize)]
+struct ListedLocation {
+    lat: Option<f64>,
+    lon: Option<f64>,
+    heading: Option<f64>,
+}
+
+impl ListedReference {
+    /// `None` if a value is none that a server sends.
+    fn stored(self) -> Option<Stored> {
+        let mut content = [0; 32];
+        hex::decode_to_slice(&self.content_sha256, &mut content).ok()?;
+        let ListedLocation { lat, lon, heading } = self.location.unwrap_or_default();
+        let location = lat.zip(lon).map(|(lat, lon)| GeoPoint::new(lat, lon));
+        Some(Stored {
+            id: self.id,
+            content: ContentHash(content),
+            location: location.transpose().ok()?,
+            heading: heading.map(Heading::new).transpose().ok()?,
+            captured_at: self.captured_at,
+        })
+    }
 }
 
 impl ServerSink {
     /// Prepares to send every photo up to `attempts` times.
-    pub(super) fn new(server: ServerArgs, attempts: u32) -> anyhow::Result<Self> {
+    pub(super) fn new(
+        server: ServerArgs,
+        attempts: u32,
+        ignores_exif: bool,
+    ) -> anyhow::Result<Self> {
         let client = ServerClient::with_attempts(server, attempts)?;
-        Ok(Self { client })
+        Ok(Self {
+            client,
+            ignores_exif,
+        })
     }
 
     /// The page that begins at `cursor`; `None` if there is no such map.
@@ -61,14 +101,17 @@ impl ServerSink {
 }
 
 impl Sink for ServerSink {
-    fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, String>> {
+    fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, Stored>> {
         let mut present = HashMap::new();
         let mut cursor: Option<String> = None;
         while let Some(page) = self.page(map, cursor.as_deref())? {
-            for reference in page.references {
-                if let (Some(id), Some(hash)) = (reference.external_id, reference.content_sha256) {
-                    present.insert(id, hash);
-                }
+            for mut reference in page.references {
+                let Some(external_id) = reference.external_id.take() else {
+                    continue;
+                };
+                let stored = reference.stored();
+                let stored = stored.context("the server lists a reference with wrong values")?;
+                present.insert(external_id, stored);
             }
             cursor = page.next;
             if cursor.is_none() {
@@ -79,7 +122,10 @@ impl Sink for ServerSink {
     }
 
     fn send(&self, upload: Upload) -> Sent {
-        let parameters = parameters(&upload);
+        let mut parameters = parameters(&upload);
+        if self.ignores_exif {
+            parameters.push(("exif", "false".to_owned()));
+        }
         let request = |connection: &Connection| -> RequestBuilder {
             connection
                 .request(Method::POST, "/references")
@@ -90,7 +136,23 @@ impl Sink for ServerSink {
         };
         let attempted = self.client.attempt(request);
         let outcome = match attempted.answer {
-            Ok(answer) => stored(answer.status(), answer.json()["id"].as_str()),
+            Ok(answer) => stored(answer.status(), answer.json()),
+            Err(error) => refused(&error),
+        };
+        Sent {
+            outcome,
+            attempts: attempted.attempts,
+        }
+    }
+
+    fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Sent {
+        let path = format!("/references/{id}");
+        let body = change(&patch);
+        let request =
+            |connection: &Connection| connection.request(Method::PATCH, &path).json(&body);
+        let attempted = self.client.attempt(request);
+        let outcome = match attempted.answer {
+            Ok(_) => Outcome::Updated,
             Err(error) => refused(&error),
         };
         Sent {
@@ -100,13 +162,34 @@ impl Sink for ServerSink {
     }
 }
 
-fn stored(status: StatusCode, id: Option<&str>) -> Outcome {
-    match id {
-        Some(id) if status == StatusCode::CREATED => Outcome::Created(id.to_owned()),
-        Some(id) => Outcome::Present(id.to_owned()),
+/// The change as the body of `PATCH /references/{id}`.
+fn change(patch: &ReferencePatch) -> Value {
+    let mut body = Map::new();
+    if let Some(Some(location)) = patch.location {
+        body.insert("lat".into(), location.lat().into());
+        body.insert("lon".into(), location.lon().into());
+    }
+    if let Some(Some(heading)) = patch.heading {
+        body.insert("heading".into(), heading.degrees().into());
+    }
+    let captured_at = patch.captured_at.flatten();
+    if let Some(time) = captured_at {
+        body.insert("captured_at".into(), time.to_string().into());
+    }
+    body.into()
+}
+
+fn stored(status: StatusCode, answer: Value) -> Outcome {
+    let id = answer["id"].as_str().map(str::to_owned);
+    if let Some(id) = id.filter(|_| status == StatusCode::CREATED) {
+        return Outcome::Created(id);
+    }
+    let reference: Option<ListedReference> = serde_json::from_value(answer).ok();
+    match reference.and_then(ListedReference::stored) {
+        Some(stored) => Outcome::Present(stored),
         None => Outcome::Refused {
             code: "unexpected_answer".into(),
-            detail: format!("the server answered {status} without a reference id"),
+            detail: format!("the server answered {status} without a reference"),
         },
     }
 }
@@ -200,7 +283,7 @@ mod tests {
             trust: TrustArgs::default(),
             timeout: 10,
         };
-        ServerSink::new(args, attempts).unwrap()
+        ServerSink::new(args, attempts, false).unwrap()
     }
 
     fn upload() -> Upload {
@@ -267,22 +350,71 @@ mod tests {
         );
     }
 
+    const ID: &str = "0197f3c2-7c1e-7d3a-9b1f-2f6f0c1d2e3f";
+
     #[test]
     fn pages_are_followed_to_the_end_and_an_unknown_map_is_empty() {
+        let reference = |external_id: &str, digit: &str, more: &str| {
+            let content = digit.repeat(64);
+            format!(
+                "{{\"id\":\"{ID}\",\"external_id\":{external_id},\
+                 \"content_sha256\":\"{content}\"{more}}}"
+            )
+        };
+        let location = ",\"location\":{\"lat\":1.5,\"lon\":-2.25,\"heading\":null},\
+                        \"captured_at\":\"2026-05-17T09:30:00Z\"";
+        let a = reference("\"a\"", "1", location);
+        let nameless = reference("null", "3", "");
+        let b = reference("\"b\"", "2", ",\"location\":null,\"captured_at\":null");
+        let first = format!("200 OK|{{\"references\":[{a},{nameless}],\"next\":\"n1\"}}");
+        let last = format!("200 OK|{{\"references\":[{b}],\"next\":null}}");
         let (url, requests) = server(vec![
-            "200 OK|{\"references\":[{\"external_id\":\"a\",\"content_sha256\":\"1\"},\
-             {\"external_id\":null}],\"next\":\"n1\"}",
-            "200 OK|{\"references\":[{\"external_id\":\"b\",\"content_sha256\":\"2\"}],\
-             \"next\":null}",
+            &*first.leak(),
+            &*last.leak(),
             "404 No|{\"code\":\"map_not_found\",\"retryable\":false}",
+            "200 OK|{\"references\":[{\"id\":\"x\"}],\"next\":null}",
         ]);
         let sink = sink(url, 2);
-        let present = sink.present(&"m".parse().unwrap()).unwrap();
+        let map: MapName = "m".parse().unwrap();
+        let present = sink.present(&map).unwrap();
+        assert_eq!(present.len(), 2);
+        assert_eq!(present["a"].content.to_string(), "1".repeat(64));
+        assert_eq!(present["a"].location, GeoPoint::new(1.5, -2.25).ok());
         assert_eq!(
-            (present.len(), present["a"].as_str(), present["b"].as_str()),
-            (2, "1", "2")
+            present["a"].captured_at.unwrap().unix_micros() / 1_000_000,
+            1_779_010_200
         );
+        assert_eq!((present["b"].location, present["b"].heading), (None, None));
         assert!(requests.iter().nth(1).unwrap().contains("cursor=n1"));
-        assert!(sink.present(&"m".parse().unwrap()).unwrap().is_empty());
+        assert!(sink.present(&map).unwrap().is_empty());
+        assert!(sink.present(&map).is_err());
+    }
+
+    #[test]
+    fn a_change_names_what_it_sets_and_nothing_else() {
+        let (url, requests) = server(vec![
+            "503 Busy\r\nretry-after: 0|{\"code\":\"overloaded\",\"retryable\":true}",
+            "200 OK|{}",
+            "404 No|{\"code\":\"reference_not_found\",\"retryable\":false}",
+        ]);
+        let sink = sink(url, 3);
+        let patch = ReferencePatch {
+            location: Some(GeoPoint::new(1.5, -2.25).ok()),
+            ..ReferencePatch::default()
+        };
+        assert_eq!(
+            change(&patch),
+            serde_json::json!({"lat": 1.5, "lon": -2.25})
+        );
+        let id: ReferenceId = ID.parse().unwrap();
+        let sent = sink.update(id, patch);
+        assert_eq!((sent.outcome, sent.attempts), (Outcome::Updated, 2));
+        let gone = sink.update(id, ReferencePatch::default());
+        assert!(matches!(gone.outcome, Outcome::Refused { .. }), "{gone:?}");
+        let request = requests.recv().unwrap();
+        assert!(
+            request.starts_with(&format!("PATCH /references/{ID} ")),
+            "{request}"
+        );
     }
 }

@@ -3,7 +3,10 @@
 use crate::cli::client::UNREACHABLE;
 use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
-use placeformer_core::types::{MapName, ReferenceFields};
+use placeformer_core::types::{
+    ContentHash, GeoPoint, Heading, MapName, ReferenceFields, ReferenceId,
+};
+use placeformer_store::ReferencePatch;
 use std::collections::HashMap;
 
 /// A photo on its way.
@@ -14,14 +17,27 @@ pub(super) struct Upload {
     pub(super) image: Bytes,
 }
 
-/// What became of it.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// A reference that the map has: what an import compares.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Stored {
+    pub(super) id: ReferenceId,
+    /// Hash of the photo's bytes.
+    pub(super) content: ContentHash,
+    pub(super) location: Option<GeoPoint>,
+    pub(super) heading: Option<Heading>,
+    pub(super) captured_at: Option<Timestamp>,
+}
+
+/// What became of a photo or a change.
+#[derive(Debug, Clone, PartialEq)]
 pub(super) enum Outcome {
     /// New and durable, under this reference id.
     Created(String),
-    /// It was there before, under this reference id.
-    Present(String),
-    /// Not stored.
+    /// It was there before.
+    Present(Stored),
+    /// Changed, and durable.
+    Updated,
+    /// Not stored, or not changed.
     Refused {
         /// A code of the error table, or `unreachable`.
         code: String,
@@ -31,7 +47,7 @@ pub(super) enum Outcome {
 }
 
 /// An outcome with the attempts it took.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct Sent {
     pub(super) outcome: Outcome,
     pub(super) attempts: u32,
@@ -39,12 +55,15 @@ pub(super) struct Sent {
 
 /// Takes photos from several threads at once.
 pub(super) trait Sink: Sync {
-    /// What the map has: the SHA-256 of the content, in hexadecimal, by external id. A map that
-    /// does not exist has nothing.
-    fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, String>>;
+    /// What the map has, by external id. A map that does not exist has nothing.
+    fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, Stored>>;
 
     /// Stores one photo; tries again itself where that may help.
     fn send(&self, upload: Upload) -> Sent;
+
+    /// Changes fields of a reference; tries again itself where that may help. An import only sets
+    /// fields and never clears any.
+    fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Sent;
 }
 
 /// Whether every other photo would fail with this code, too.

@@ -1,15 +1,15 @@
 //! An import straight into a store: the pipeline of the server without the server.
 
-use super::sink::{Outcome, Sent, Sink, Upload};
+use super::sink::{Outcome, Sent, Sink, Stored, Upload};
 use crate::cli::progress::ProgressBars;
 use crate::config::{Config, ModelOverrides, Overrides};
 use crate::ops::{Health, Metrics};
 use crate::pipeline::{Caller, IngestRequest, Parts, PipelineError, Service};
 use anyhow::Context;
 use placeformer_core::error::ErrorCode;
-use placeformer_core::types::MapName;
+use placeformer_core::types::{MapName, Reference, ReferenceId};
 use placeformer_models::open_extractor;
-use placeformer_store::{Cursor, Page, SqliteStore};
+use placeformer_store::{Cursor, Page, ReferencePatch, SqliteStore};
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -65,7 +65,7 @@ impl StoreSink {
 }
 
 impl Sink for StoreSink {
-    fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, String>> {
+    fn present(&self, map: &MapName) -> anyhow::Result<HashMap<String, Stored>> {
         let mut present = HashMap::new();
         let mut after = None;
         loop {
@@ -75,8 +75,8 @@ impl Sink for StoreSink {
                 Err(error) => return Err(error.into()),
             };
             for reference in page.references {
-                if let Some(id) = reference.fields.external_id {
-                    present.insert(id.into(), reference.content_hash.to_string());
+                if let Some(id) = &reference.fields.external_id {
+                    present.insert(id.to_string(), Stored::from(&reference));
                 }
             }
             after = page.next;
@@ -89,19 +89,49 @@ impl Sink for StoreSink {
 
     fn send(&self, upload: Upload) -> Sent {
         let Upload { map, fields, image } = upload;
-        let request = IngestRequest { map, fields, image };
-        let ingesting = self.service.ingest(&Caller::Local, request);
-        let outcome = match self.runtime.block_on(ingesting) {
-            Ok(answer) if answer.created => Outcome::Created(answer.reference.id.to_string()),
-            Ok(answer) => Outcome::Present(answer.reference.id.to_string()),
-            Err(error) => Outcome::Refused {
-                code: error.code().as_str().into(),
-                detail: format!("{:#}", anyhow::Error::new(error)),
-            },
+        let request = IngestRequest {
+            map,
+            fields,
+            image,
+            // The import has read the photo, and knows more about it.
+            reads_photo: false,
         };
-        Sent {
-            outcome,
-            attempts: 1,
+        let ingested = self
+            .runtime
+            .block_on(self.service.ingest(&Caller::Local, request));
+        sent_once(ingested.map(|answer| match answer.created {
+            true => Outcome::Created(answer.reference.id.to_string()),
+            false => Outcome::Present(Stored::from(&answer.reference)),
+        }))
+    }
+
+    fn update(&self, id: ReferenceId, patch: ReferencePatch) -> Sent {
+        let updated = self
+            .runtime
+            .block_on(self.service.update(&Caller::Local, id, patch));
+        sent_once(updated.map(|_| Outcome::Updated))
+    }
+}
+
+impl From<&Reference> for Stored {
+    fn from(reference: &Reference) -> Self {
+        Self {
+            id: reference.id,
+            content: reference.content_hash,
+            location: reference.fields.location,
+            heading: reference.fields.heading,
+            captured_at: reference.fields.captured_at,
         }
+    }
+}
+
+fn sent_once(outcome: Result<Outcome, PipelineError>) -> Sent {
+    let refused = |error: PipelineError| Outcome::Refused {
+        code: error.code().as_str().into(),
+        detail: format!("{:#}", anyhow::Error::new(error)),
+    };
+    Sent {
+        outcome: outcome.unwrap_or_else(refused),
+        attempts: 1,
     }
 }

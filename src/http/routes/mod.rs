@@ -39,7 +39,7 @@ pub static ROUTES: &[Route] = &[
             ErrorCode::MemoryPressure,
             ErrorCode::DiskFull,
         ],
-        answer_example: Some(examples::reference),
+        answer_example: Some(examples::created_reference),
         handler: Handler::Operation(|| routes!(references::create)),
     },
     Route {

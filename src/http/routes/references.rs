@@ -1,6 +1,6 @@
 //! `/references`: the photos that make up the maps.
 
-use super::shapes::{ReferenceBody, metadata, point, present, timed};
+use super::shapes::{NewReferenceBody, ReferenceBody, metadata, point, present, timed};
 use crate::http::access::Access;
 use crate::http::answer;
 use crate::http::body::{ImageUpload, read_json, read_query, read_upload};
@@ -85,6 +85,11 @@ pub struct ReferenceParams {
     #[param(value_type = Option<String>, example = "{\"camera\":\"left\"}")]
     #[serde(default, deserialize_with = "metadata")]
     pub metadata: Option<Metadata>,
+    /// Whether position, heading and time are read from the photo's EXIF and XMP where the request
+    /// gives none. A time without an offset from UTC is then taken as UTC. By default they are.
+    #[schema(default = true)]
+    #[param(example = true)]
+    pub exif: Option<bool>,
 }
 
 impl ReferenceParams {
@@ -111,7 +116,8 @@ impl ReferenceParams {
 ///
 /// Acknowledged only after it is durable and can be found. The image is the raw body with the
 /// fields as query parameters, or a multipart part `image` beside a part `json`, or base64 in JSON
-/// beside the fields.
+/// beside the fields. Position, heading and time that the request leaves out are taken from the
+/// photo's own EXIF or XMP, unless `exif` is false; `sources` says where each comes from.
 #[utoipa::path(
     post,
     path = "/references",
@@ -122,7 +128,7 @@ impl ReferenceParams {
         (
             status = 201,
             description = "It is new, durable and can be found.",
-            body = ReferenceBody,
+            body = NewReferenceBody,
             headers(
                 ("location" = String, description = "Its path."),
                 ("server-timing" = String, description = "Milliseconds per stage."),
@@ -131,7 +137,7 @@ impl ReferenceParams {
         (
             status = 200,
             description = "The same photo was there before under this external id.",
-            body = ReferenceBody,
+            body = NewReferenceBody,
             headers(
                 ("location" = String, description = "Its path."),
                 ("server-timing" = String, description = "Milliseconds per stage."),
@@ -149,13 +155,20 @@ pub async fn create(
     service.may_store()?;
     let mut upload = read_upload::<ReferenceParams>(&state, request, &UPLOAD).await?;
     let image = upload.take("image")?;
+    let reads_photo = upload.params.exif.unwrap_or(true);
     let (map, fields) = std::mem::take(&mut upload.params).checked()?;
     access.check_map(&map)?;
-    let new = IngestRequest { map, fields, image };
+    let new = IngestRequest {
+        map,
+        fields,
+        image,
+        reads_photo,
+    };
     let answer = service.ingest(&access.caller, new).await?;
     let location = HeaderValue::from_str(&format!("/references/{}", answer.reference.id));
     let IngestAnswer {
         reference,
+        sources,
         created,
         timings,
     } = answer;
@@ -164,7 +177,7 @@ pub async fn create(
     } else {
         StatusCode::OK
     };
-    let body = || ReferenceBody::from(reference);
+    let body = move || NewReferenceBody::new(reference, sources);
     let mut response = timed(&state, status, &timings, body).await?;
     if let Ok(location) = location {
         response.headers_mut().insert(header::LOCATION, location);

@@ -4,7 +4,7 @@ use crate::http::answer;
 use crate::http::codec::Workload;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
-use crate::pipeline::Timings;
+use crate::pipeline::{FieldSource, FieldSources, Timings};
 use axum::http::{HeaderName, HeaderValue, StatusCode};
 use axum::response::Response;
 use placeformer_core::types::{GeoPoint, Heading, Metadata, Reference, Timestamp};
@@ -80,6 +80,66 @@ impl From<Reference> for ReferenceBody {
             content_sha256: reference.content_hash.to_string(),
             model: reference.model.to_string(),
             created_at: reference.created_at,
+        }
+    }
+}
+
+/// A reference as the answer to its upload.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct NewReferenceBody {
+    #[serde(flatten)]
+    reference: ReferenceBody,
+    /// Where its fields come from.
+    sources: SourcesBody,
+}
+
+/// Where the fields of a reference come from; null where it has no value.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct SourcesBody {
+    /// That of latitude and longitude.
+    location: Option<SourceName>,
+    /// That of the heading.
+    heading: Option<SourceName>,
+    /// That of the time.
+    captured_at: Option<SourceName>,
+}
+
+/// Where a field comes from: `request`, the photo's own `exif` or `xmp`, or `stored`, where the
+/// photo was there before and its fields are as they were.
+#[derive(Debug, Serialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum SourceName {
+    /// The request.
+    Request,
+    /// The photo's EXIF.
+    Exif,
+    /// The photo's XMP.
+    Xmp,
+    /// It was stored before.
+    Stored,
+}
+
+impl From<FieldSource> for SourceName {
+    fn from(source: FieldSource) -> Self {
+        match source {
+            FieldSource::Request => Self::Request,
+            FieldSource::Exif => Self::Exif,
+            FieldSource::Xmp => Self::Xmp,
+            FieldSource::Stored => Self::Stored,
+        }
+    }
+}
+
+impl NewReferenceBody {
+    /// The answer for a reference whose fields come from `sources`.
+    pub fn new(reference: Reference, sources: FieldSources) -> Self {
+        Self {
+            reference: reference.into(),
+            sources: SourcesBody {
+                location: sources.location.map(Into::into),
+                heading: sources.heading.map(Into::into),
+                captured_at: sources.captured_at.map(Into::into),
+            },
         }
     }
 }

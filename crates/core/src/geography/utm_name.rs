@@ -9,9 +9,13 @@
 
 use super::position::{GeoPoint, Heading};
 use super::utm_zone::{MetricPoint, UtmZone};
+use crate::clock::in_range;
 use crate::invalid::InvalidValue;
 use crate::types::Timestamp;
 use time::{Date, Month, PrimitiveDateTime, Time};
+
+/// Length of a degree of latitude in metres.
+const METRES_PER_DEGREE: f64 = 111_320.0;
 
 /// What a name says.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,8 +24,12 @@ pub struct UtmName {
     pub point: MetricPoint,
     /// The zone they refer to.
     pub zone: Option<UtmZone>,
+    /// Zone and band as the name gives them, where it gives both and there is no such zone.
+    pub unknown_zone: Option<String>,
     /// Latitude and longitude, where the name spells them out.
     pub geo: Option<GeoPoint>,
+    /// How far these two may be from the truth in metres, because they have only so many decimals.
+    pub(super) geo_tolerance_m: f64,
     /// Identifier of the panorama or frame; empty if absent.
     pub pano_id: String,
     /// Where the camera looked.
@@ -45,9 +53,14 @@ impl UtmName {
         };
         let lat = fields.number(4);
         let lon = fields.number(5);
+        let (number, band) = (fields.text(2), fields.text(3));
+        let zone = UtmZone::new(number, band);
+        let names_both = !number.is_empty() && !band.is_empty();
         Ok(Self {
             point: MetricPoint { east, north },
-            zone: UtmZone::new(fields.text(2), fields.text(3)),
+            zone,
+            unknown_zone: (zone.is_none() && names_both).then(|| format!("{number}{band}")),
+            geo_tolerance_m: tolerance_m(fields.text(4)).max(tolerance_m(fields.text(5))),
             geo: lat
                 .zip(lon)
                 .and_then(|(lat, lon)| GeoPoint::new(lat, lon).ok()),
@@ -58,15 +71,14 @@ impl UtmName {
             captured_at: parse_time(fields.text(12)),
         })
     }
+}
 
-    /// The position on the Earth: from the grid coordinates and the zone in the name, else in
-    /// `fallback`, else from the latitude and longitude in the name (which carry fewer digits).
-    pub fn location(&self, fallback: Option<UtmZone>) -> Option<GeoPoint> {
-        self.zone
-            .or(fallback)
-            .and_then(|zone| zone.to_geo(self.point))
-            .or(self.geo)
-    }
+/// The length of one unit of the last decimal of an angle in degrees, on a meridian.
+fn tolerance_m(degrees: &str) -> f64 {
+    let decimals = degrees
+        .split_once('.')
+        .map_or(0, |(_, decimals)| decimals.len());
+    METRES_PER_DEGREE / 10f64.powi(decimals.min(15) as i32)
 }
 
 /// The parts between the `@` of a file name, without its extension.
@@ -109,7 +121,8 @@ fn parse_time(text: &str) -> Option<Timestamp> {
         Some(part) => part.parse().ok(),
         None => Some(default),
     };
-    let year = day_part.get(..4)?.parse().ok()?;
+    let year = day_part.get(..4).filter(|year| !year.starts_with('+'))?;
+    let year = year.parse().ok()?;
     let month = Month::try_from(digits(day_part, 4..6, 1)?).ok()?;
     let date = Date::from_calendar_date(year, month, digits(day_part, 6..8, 1)?).ok()?;
     let time = Time::from_hms(
@@ -117,7 +130,7 @@ fn parse_time(text: &str) -> Option<Timestamp> {
         digits(time_part, 2..4, 0)?,
         digits(time_part, 4..6, 0)?,
     );
-    Timestamp::of(PrimitiveDateTime::new(date, time.ok()?).assume_utc())
+    in_range(PrimitiveDateTime::new(date, time.ok()?).assume_utc()).and_then(Timestamp::of)
 }
 
 #[cfg(test)]
@@ -152,11 +165,13 @@ mod tests {
             parsed.captured_at,
             Timestamp::of(datetime!(2013-11-01 0:00 UTC))
         );
-        let geo = parsed.location(None).unwrap();
+        let found = parsed.position(None);
+        let geo = found.location.unwrap();
         assert!(
             geo.distance_m(GeoPoint::new(40.42412, -80.00610).unwrap()) < 2_000.0,
             "{geo:?}"
         );
+        assert_eq!(found.doubt, None);
     }
 
     #[test]
@@ -196,6 +211,7 @@ mod tests {
         let new_year = Timestamp::of(datetime!(2019-01-01 0:00 UTC));
         assert_eq!(parse_time("2019"), new_year);
         assert_eq!(parse_time("201913"), None);
+        assert_eq!(parse_time("0000"), None);
         assert_eq!(parse_time(""), None);
     }
 }

@@ -2,6 +2,7 @@
 
 use super::position::GeoPoint;
 use crate::invalid::InvalidValue;
+use std::fmt;
 
 /// A point on a plane, in metres east and north of the plane's origin.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -22,6 +23,12 @@ pub struct UtmZone {
     pub number: u8,
     /// Latitude band, C to X without I and O; N and above lie north of the equator.
     pub band: char,
+}
+
+impl fmt::Display for UtmZone {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}{}", self.number, self.band)
+    }
 }
 
 impl std::str::FromStr for UtmZone {
@@ -48,6 +55,15 @@ impl UtmZone {
         let band = band.chars().next()?.to_ascii_uppercase();
         let is_zone = (1..=60).contains(&number) && BANDS.contains(band);
         is_zone.then_some(Self { number, band })
+    }
+
+    /// The southernmost and the northernmost latitude of the band, in degrees.
+    pub(super) fn latitudes(self) -> (f64, f64) {
+        let index = BANDS.find(self.band).unwrap_or_default();
+        let south = 8.0 * index as f64 - 80.0;
+        // The northernmost band is longer, so that it reaches the north of Greenland.
+        let north = if self.band == 'X' { 84.0 } else { south + 8.0 };
+        (south, north)
     }
 
     /// The zone a position lies in; none beyond 80 degrees south and 84 north.
@@ -96,6 +112,20 @@ mod tests {
     use super::*;
 
     #[test]
+    fn bands_lie_on_top_of_each_other() {
+        let latitudes = |text: &str| text.parse::<UtmZone>().unwrap().latitudes();
+        assert_eq!(latitudes("1C"), (-80.0, -72.0));
+        assert_eq!(
+            (latitudes("1M"), latitudes("1N")),
+            ((-8.0, 0.0), (0.0, 8.0))
+        );
+        assert_eq!(
+            (latitudes("1S"), latitudes("1X")),
+            ((32.0, 40.0), (72.0, 84.0))
+        );
+    }
+
+    #[test]
     fn grid_and_globe_agree_both_ways() {
         let zone: UtmZone = "54S".parse().unwrap();
         let tokyo = GeoPoint::new(35.6586, 139.7454).unwrap();
@@ -104,6 +134,7 @@ mod tests {
         // At the edge of a zone too.
         let edge = GeoPoint::new(36.0, 143.9999).unwrap();
         assert!(zone.to_geo(zone.from_geo(edge)).unwrap().distance_m(edge) < 0.01);
+        assert_eq!(zone.to_string(), "54S");
         for bad in ["", "T", "61T", "33I", "0N", "33"] {
             assert!(bad.parse::<UtmZone>().is_err(), "{bad}");
         }

@@ -20,7 +20,7 @@
 //! | `orientation` | turning an image upright |
 //! | `resize` | resizing and normalisation |
 //! | `encode` | back to JPEG and PNG |
-//! | `exif` | position, heading and time of a photo |
+//! | `exif` | position, heading and time of a photo, from its EXIF and XMP |
 
 mod config;
 mod decode;
@@ -39,7 +39,7 @@ mod webp;
 pub use config::ImageConfig;
 pub use encode::{encode_jpeg, encode_png};
 pub use error::ImageError;
-pub use exif::{ExifInfo, read_exif};
+pub use exif::{ExifInfo, ExifSources, MetadataBlock, read_exif};
 pub use load::{decode, load_tensor};
 pub use resize::{DEVIATION, MEAN};
 pub use rgb::RgbImage;
