@@ -5,9 +5,7 @@ use super::sink::{Outcome, Sent, Sink, Stored, Upload};
 use crate::cli::client::{BYTES, ClientError, Connection, ServerArgs, ServerClient};
 use anyhow::Context;
 use placeformer_core::error::ErrorCode;
-use placeformer_core::types::{
-    ContentHash, GeoPoint, Heading, MapName, ReferenceId, Timestamp,
-};
+use placeformer_core::types::{ContentHash, GeoPoint, Heading, MapName, ReferenceId, Timestamp};
 use placeformer_store::ReferencePatch;
 use reqwest::header::CONTENT_TYPE;
 use reqwest::{Method, RequestBuilder, StatusCode};

@@ -4,7 +4,7 @@ use crate::cli::client::UNREACHABLE;
 use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{
-    ContentHash, GeoPoint, Heading, MapName, ReferenceFields, ReferenceId,
+    ContentHash, GeoPoint, Heading, MapName, ReferenceFields, ReferenceId, Timestamp,
 };
 use placeformer_store::ReferencePatch;
 use std::collections::HashMap;

@@ -11,7 +11,7 @@ use anyhow::{Context, ensure};
 use matching::PhotoNames;
 pub(super) use matching::folder_of;
 use placeformer_core::printable::Printable;
-use placeformer_core::types::{GeoPoint, Heading};
+use placeformer_core::types::{GeoPoint, Heading, Timestamp};
 use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
 

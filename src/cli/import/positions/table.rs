@@ -12,7 +12,7 @@ use anyhow::{Context, anyhow, bail, ensure};
 use csv::{ReaderBuilder, StringRecord, Trim};
 use placeformer_core::clock::Clock;
 use placeformer_core::printable::Printable;
-use placeformer_core::types::{GeoPoint, Heading};
+use placeformer_core::types::{GeoPoint, Heading, Timestamp};
 
 /// A meaning with the headings for it, in lower case without spaces, dashes and underscores. Of two
 /// columns with the same meaning, the one whose heading stands first here counts.

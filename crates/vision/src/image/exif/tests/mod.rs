@@ -22,7 +22,10 @@ fn every_container_and_both_orders_say_the_same() {
             assert!((place.lat() - 48.8584).abs() < 1e-6, "{container:?}");
             assert!((place.lon() - 2.2945).abs() < 1e-6, "{container:?}");
             assert_eq!(info.heading.unwrap().degrees(), 270.5);
-            assert_eq!(info.captured_at.unwrap().instant().unix_timestamp(), 1_772_375_405);
+            assert_eq!(
+                info.captured_at.unwrap().instant().unix_timestamp(),
+                1_772_375_405
+            );
             let exif = Some(MetadataBlock::Exif);
             let expected = ExifSources {
                 location: exif,

@@ -4,6 +4,7 @@ use super::writer::{Exif, Value};
 use crate::image::exif::{
     DATE_TIME_DIGITIZED, OFFSET_TIME, OFFSET_TIME_DIGITIZED, SUBSEC_TIME, SUBSEC_TIME_ORIGINAL,
 };
+use placeformer_core::types::Timestamp;
 use time::OffsetDateTime;
 use time::macros::datetime;
 
