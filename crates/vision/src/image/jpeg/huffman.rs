@@ -224,3 +224,106 @@ fn has_ff(word: u64) -> bool {
     let inverted = !word;
     inverted.wrapping_sub(LOW) & word & (LOW << 7) != 0
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Bytes of which many are `FF`, as they are and as a file holds them.
+    fn escaped() -> (Vec<u8>, Vec<u8>) {
+        let plain = (0..200u32).map(|i| match i * i % 7 {
+            1 | 4 => 0xff,
+            _ => (i * 89) as u8,
+        });
+        let plain: Vec<u8> = plain.collect();
+        let stored = plain.iter().flat_map(|&byte| match byte {
+            0xff => vec![0xff, 0],
+            _ => vec![byte],
+        });
+        (plain.clone(), stored.collect())
+    }
+
+    #[test]
+    fn bits_come_in_order_whatever_their_number() {
+        let (plain, stored) = escaped();
+        let bit = |at: usize| u32::from(plain[at / 8] >> (7 - at % 8) & 1);
+        for step in 1..=16 {
+            let mut bits = Bits::new(&stored);
+            let mut at = 0;
+            while at + step <= 8 * plain.len() {
+                let expected = (at..at + step).fold(0, |value, at| value << 1 | bit(at));
+                assert_eq!(
+                    bits.bits(step as u32).unwrap(),
+                    expected,
+                    "{step} bits at {at}"
+                );
+                at += step;
+                let plain_bytes = at.div_ceil(8);
+                let escapes = plain[..plain_bytes].iter().filter(|&&byte| byte == 0xff);
+                assert_eq!(bits.bytes_taken(), plain_bytes + escapes.count());
+            }
+            let left = (8 * plain.len() - at) as u64;
+            assert_eq!(bits.skip_many(left + 1), Err(Fault::DataEnd));
+        }
+    }
+
+    #[test]
+    fn a_marker_ends_the_data() {
+        let mut bits = Bits::new(&[0x12, 0xff, 0xd0, 0x34]);
+        assert_eq!(bits.bits(8).unwrap(), 0x12);
+        assert_eq!(bits.bytes_taken(), 1);
+        assert_eq!(bits.bits(1), Err(Fault::DataEnd));
+    }
+
+    #[test]
+    fn codes_of_every_length_are_found() {
+        // One code of each length: 0, 10, 110, and so on.
+        let symbols: Vec<u8> = (101..=116).collect();
+        let stored = StoredTable {
+            counts: &[1; 16],
+            symbols: &symbols,
+        };
+        let table = HuffmanTable::new(stored).unwrap();
+        for length in 1..=16u32 {
+            let code = u16::MAX.checked_shl(17 - length).unwrap_or(0);
+            let data: Vec<u8> = code
+                .to_be_bytes()
+                .into_iter()
+                .flat_map(|byte| match byte {
+                    0xff => vec![0xff, 0],
+                    _ => vec![byte],
+                })
+                .collect();
+            let mut bits = Bits::new(&data);
+            assert_eq!(bits.symbol(&table).unwrap(), 100 + length as u8);
+            let left = 16 - length;
+            bits.skip(left).unwrap();
+            assert_eq!(bits.skip(1), Err(Fault::DataEnd));
+        }
+        let mut bits = Bits::new(&[0xff, 0, 0xff, 0]);
+        assert_eq!(bits.symbol(&table), Err(Fault::BadCode));
+    }
+
+    #[test]
+    fn tables_with_too_many_codes_are_refused() {
+        let table = |counts: [u8; 16]| {
+            let symbols = vec![0; counts.iter().map(|&count| usize::from(count)).sum()];
+            let stored = StoredTable {
+                counts: &counts,
+                symbols: &symbols,
+            };
+            HuffmanTable::new(stored).is_ok()
+        };
+        let mut counts = [0; 16];
+        counts[0] = 1;
+        assert!(table(counts));
+        counts[1] = 1;
+        assert!(table(counts));
+        // The code 11 has ones only.
+        counts[1] = 2;
+        assert!(!table(counts));
+        counts[0] = 255;
+        assert!(!table(counts));
+        assert!(table([0; 16]), "no codes at all, which no data can use");
+    }
+}
