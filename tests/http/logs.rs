@@ -104,8 +104,14 @@ fn a_deadline_that_passes_is_no_error_in_the_log() {
         assert!(matches!(status, 200 | 504), "{answer}");
         status == 504
     };
-    assert!((0..500).any(|seed| is_late(&seed)), "a millisecond was always enough");
+    assert!(
+        (0..500).any(|seed| is_late(&seed)),
+        "a millisecond was always enough"
+    );
     for line in lines(&log) {
-        assert!(line["level"] == "INFO" || line["level"] == "DEBUG", "{line}");
+        assert!(
+            line["level"] == "INFO" || line["level"] == "DEBUG",
+            "{line}"
+        );
     }
 }

@@ -166,7 +166,10 @@ fn services(file: &str) -> Vec<(String, String)> {
     let text = read(file);
     let mut services: Vec<(String, String)> = Vec::new();
     let mut section = "";
-    for line in text.lines().filter(|line| !line.trim_start().starts_with('#')) {
+    for line in text
+        .lines()
+        .filter(|line| !line.trim_start().starts_with('#'))
+    {
         let indent = line.len() - line.trim_start().len();
         match indent {
             0 if !line.is_empty() => section = line,
@@ -188,7 +191,11 @@ fn services(file: &str) -> Vec<(String, String)> {
 
 #[test]
 fn compose_asks_for_the_password_of_grafana_and_limits_every_service() {
-    let files = ["compose.yaml", "compose.grafana.yaml", "compose.replicas.yaml"];
+    let files = [
+        "compose.yaml",
+        "compose.grafana.yaml",
+        "compose.replicas.yaml",
+    ];
     let mut images = 0;
     for file in files {
         for (name, lines) in services(file) {
@@ -197,7 +204,10 @@ fn compose_asks_for_the_password_of_grafana_and_limits_every_service() {
             for limit in ["cpus:", "mem_limit:", "pids_limit:"] {
                 assert!(is_addition || has(limit), "{file}: {name} has no {limit}");
             }
-            let Some(image) = lines.lines().find_map(|line| line.trim().strip_prefix("image: ")) else {
+            let Some(image) = lines
+                .lines()
+                .find_map(|line| line.trim().strip_prefix("image: "))
+            else {
                 continue;
             };
             images += 1;

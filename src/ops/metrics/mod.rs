@@ -11,6 +11,7 @@ pub use labels::{MemoryComponent, PipelineStage, Rejection};
 use placeformer_core::types::MapName;
 use prometheus::core::Collector;
 use prometheus::process_collector::ProcessCollector;
+use prometheus::proto::MetricFamily;
 use prometheus::{
     Encoder, Error, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge,
     IntGaugeVec, Opts, Registry, TextEncoder,
@@ -255,15 +256,17 @@ impl Metrics {
     /// A series cannot be written as text.
     pub fn render(&self, is_shown: impl Fn(&MapName) -> bool) -> Result<String, Error> {
         let mut families = self.registry.gather();
-        families.extend(self.reference_series(is_shown)?.collect());
+        families.extend(self.reference_series(is_shown)?);
         TextEncoder::new().encode_to_string(&families)
     }
 
-    fn reference_series(&self, is_shown: impl Fn(&MapName) -> bool) -> Result<IntGaugeVec, Error> {
-        let gauges = IntGaugeVec::new(
-            options("references", "References that can be found."),
-            &["map"],
-        )?;
+    fn reference_series(
+        &self,
+        is_shown: impl Fn(&MapName) -> bool,
+    ) -> Result<Vec<MetricFamily>, Error> {
+        // A registry of its own puts them in the order of the others: that of their labels.
+        let series = Series(Registry::new());
+        let gauges = series.gauges("references", "References that can be found.", &["map"])?;
         let maps = self.lock_references();
         let (mut shown, hidden): (Vec<_>, Vec<_>) = maps.iter().partition(|(map, _)| is_shown(map));
         shown.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
@@ -274,7 +277,7 @@ impl Metrics {
         let other: u64 = rest.iter().chain(&hidden).map(|(_, count)| count).sum();
         // Added, because a map may have that name, too.
         gauges.with_label_values(&[OTHER_MAPS]).add(other as i64);
-        Ok(gauges)
+        Ok(series.0.gather())
     }
 
     // A thread that panics with the lock leaves the list whole, because it is replaced by one
