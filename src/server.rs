@@ -5,6 +5,7 @@
 //! both are open.
 
 use crate::config::{Config, ConfigError, LoadedFrom};
+use crate::http::problem::error_chain;
 use crate::http::{AppState, Certificate, TlsError, serve_encrypted};
 use crate::ops::{Health, Metrics, disk, reload, shutdown};
 use crate::pipeline::{DescriptorSource, Parts, PipelineError, Service};
@@ -319,19 +320,19 @@ fn follow_keys(
 
 /// Puts keys that were read again in force, if they are good and others than before.
 fn renew_keys(state: &AppState, read: Result<Config, ConfigError>) {
-    let renewed = read
-        .map_err(anyhow::Error::from)
-        .and_then(|config| Ok((state.renew_auth(&config.auth)?, config.auth.keys.len())));
+    let renewed = match read {
+        Ok(config) => state
+            .renew_auth(&config.auth)
+            .map_err(|error| error.to_string()),
+        Err(error) => Err(error_chain(&error)),
+    };
     match renewed {
-        Ok((true, holders)) => tracing::info!(holders, "other keys are in force"),
-        Ok((false, _)) => tracing::debug!("the keys are the same as before"),
-        Err(error) => {
-            let error = format!("{error:#}");
-            tracing::error!(
-                error,
-                "the keys cannot be read again; the old ones stay in force"
-            );
-        }
+        Ok(true) => tracing::info!("other keys are in force"),
+        Ok(false) => tracing::debug!("the keys are the same as before"),
+        Err(error) => tracing::error!(
+            error,
+            "the keys cannot be read again; the old ones stay in force"
+        ),
     }
 }
 

@@ -5,7 +5,13 @@ fn from_toml(text: &str) -> Result<Config, ConfigError> {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("placeformer.toml");
     std::fs::write(&path, text).unwrap();
-    Config::load(Some(&path), &Overrides::default())
+    let loaded = Config::load(Some(&path), &Overrides::default())?;
+    let from = loaded.loaded_from.as_ref().unwrap();
+    assert_eq!(from.file.as_deref(), Some(path.as_path()));
+    Ok(Config {
+        loaded_from: None,
+        ..loaded
+    })
 }
 
 fn from_variable(name: &str, value: &str) -> Result<Config, ConfigError> {
@@ -207,7 +213,8 @@ fn the_manual_says_what_the_code_does_with_a_setting() {
         "Never more than a quarter of the reserve",
         "at most a quarter of what the disk has left",
         "printf %s KEY | sha256sum",
-        "  role: \"read\" (queries, matches and listings) or \"write\" (everything).",
+        "  role: \"read\" (queries, matches, listings and metrics), \"write\" (everything), or",
+        "  maps: The maps that it is limited to, by name or by the beginning of names ([\"city-*\"])",
         "0 means 85% of what the process may use",
     ] {
         assert!(

@@ -186,7 +186,7 @@ impl From<InvalidName> for ApiError {
 
 /// The error with its causes. A cause whose words are already in the text is left out, because many
 /// errors repeat their source.
-fn error_chain(error: &dyn std::error::Error) -> String {
+pub fn error_chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut source = error.source();
     while let Some(cause) = source {

@@ -9,6 +9,9 @@ use std::fmt;
 /// Bytes of a body beyond its images: parameters, multipart boundaries.
 pub(super) const MAX_PARAMETER_BYTES: usize = 256 << 10;
 
+/// Deepest nesting of JSON, as of the parsers that others use.
+const DEEPEST: usize = 127;
+
 /// Images and parameters, still in the buffers they were copied or decoded to.
 #[derive(Default)]
 pub(super) struct BodyParts {
@@ -39,6 +42,10 @@ impl JsonObject {
         let members = counted
             .and_then(|members| deserializer.end().map(|()| members))
             .map_err(json_error)?;
+        if is_deeper_than(&text, DEEPEST) {
+            let reason = format!("the JSON is nested more than {DEEPEST} levels deep");
+            return Err(ApiError::malformed(reason));
+        }
         Ok(Self { text, members })
     }
 
@@ -64,6 +71,27 @@ impl JsonObject {
             ApiError::new(reason.code, format!("{path}: {}", reason.detail))
         })
     }
+}
+
+/// Whether JSON, whose syntax is known to be right, has more than `levels` open brackets anywhere.
+fn is_deeper_than(json: &[u8], levels: usize) -> bool {
+    let mut open = 0;
+    let mut in_text = false;
+    let mut is_escaped = false;
+    for byte in json {
+        match byte {
+            _ if is_escaped => is_escaped = false,
+            b'\\' => is_escaped = true,
+            b'"' => in_text = !in_text,
+            b'{' | b'[' if !in_text => open += 1,
+            b'}' | b']' if !in_text => open -= 1,
+            _ => {}
+        }
+        if open > levels {
+            return true;
+        }
+    }
+    false
 }
 
 struct CountMembers;

@@ -286,15 +286,17 @@ impl Metrics {
     fn families(&self, is_shown: impl Fn(&MapName) -> bool) -> Result<Vec<MetricFamily>, Error> {
         self.lost_log_lines.follow(logging::lost_lines());
         let mut families = self.registry.gather();
-        families.extend(self.reference_series(is_shown)?.collect());
+        families.extend(self.reference_series(is_shown)?);
         Ok(families)
     }
 
-    fn reference_series(&self, is_shown: impl Fn(&MapName) -> bool) -> Result<IntGaugeVec, Error> {
-        let gauges = IntGaugeVec::new(
-            options("references", "References that can be found."),
-            &["map"],
-        )?;
+    fn reference_series(
+        &self,
+        is_shown: impl Fn(&MapName) -> bool,
+    ) -> Result<Vec<MetricFamily>, Error> {
+        // A registry of its own puts them in the order of the others: that of their labels.
+        let series = Series(Registry::new());
+        let gauges = series.gauges("references", "References that can be found.", &["map"])?;
         let maps = self.lock_references();
         let (mut shown, hidden): (Vec<_>, Vec<_>) = maps.iter().partition(|(map, _)| is_shown(map));
         shown.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
@@ -305,7 +307,7 @@ impl Metrics {
         let other: u64 = rest.iter().chain(&hidden).map(|(_, count)| count).sum();
         // Added, because a map may have that name, too.
         gauges.with_label_values(&[OTHER_MAPS]).add(other as i64);
-        Ok(gauges)
+        Ok(series.0.gather())
     }
 
     // A thread that panics with the lock leaves the list whole, because it is replaced by one
