@@ -17,12 +17,13 @@ pub(super) fn live() -> Value {
 
 /// The answer of `/readyz` while requests are taken.
 pub(super) fn ready() -> Value {
-    json!({"status": "ready", "progress": null})
+    json!({"status": "ready", "progress": null, "detail": null})
 }
 
 /// The answer of `/readyz` while they are not.
 pub(super) fn not_ready() -> Value {
-    json!({"status": "building_index", "progress": {"done": 61_440, "total": 250_000}})
+    let progress = json!({"done": 61_440, "total": 250_000});
+    json!({"status": "building_index", "progress": progress, "detail": null})
 }
 
 /// The beginning of the metrics.

@@ -35,7 +35,6 @@ pub struct ReadyBody {
     /// Progress of `building_index`: references indexed and in all.
     progress: Option<ProgressBody>,
     /// Of `storage_lost`: what is wrong.
-    #[serde(skip_serializing_if = "Option::is_none")]
     detail: Option<String>,
 }
 

@@ -147,6 +147,13 @@ pub(super) fn open_reader(path: &Path, config: &StoreConfig) -> Result<Connectio
     open().map_err(failed("opening it for reading"))
 }
 
+/// The engine's count of what other connections have committed, as this one sees it: two numbers
+/// of the same connection differ if any has in between.
+pub(super) fn data_version(connection: &Connection) -> Option<i64> {
+    let mut statement = connection.prepare_cached("PRAGMA data_version").ok()?;
+    statement.query_row([], |row| row.get(0)).ok()
+}
+
 fn set_caches(connection: &Connection, config: &StoreConfig) -> rusqlite::Result<()> {
     connection.set_prepared_statement_cache_capacity(STATEMENTS);
     connection.pragma_update(None, "temp_store", "memory")?;

@@ -127,7 +127,10 @@ impl SqliteStore {
         tail::begin(&connection);
         purge::abandon_unfinished_heads(&connection)?;
         let quarantine = Quarantine::load(&connection)?;
-        let storage = Arc::new(Storage::watch(directory)?);
+        let storage = Arc::new(Storage::watch(
+            directory,
+            engine::data_version(&connection),
+        )?);
         let files = Files {
             reserve,
             mark,
@@ -369,9 +372,10 @@ impl MaintainPlaces for SqliteStore {
     }
 
     fn check_storage(&self) -> Result<(), StoreError> {
-        self.storage.check()?;
-        if self.storage.has_failed() {
-            // Whether the disk takes writes again is known once it has taken one.
+        let is_as_left = self.storage.is_as_left()?;
+        if !is_as_left || self.storage.has_failed() {
+            // Whether the disk takes writes again is known once it has taken one; whether what has
+            // changed is right, the writer can ask the engine.
             self.database.write(Effect::Shrinks, |_| Ok(()))?;
         }
         Ok(())

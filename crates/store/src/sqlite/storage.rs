@@ -4,8 +4,9 @@
 //! exchanged under a running server, the engine goes on writing and syncing files that nobody will
 //! ever open again. So before and after each commit the files are looked up by their names and
 //! compared with those that were opened: a few system calls, microseconds beside a sync of the
-//! disk. The database and its log are written by the one writer alone, so their size and time of
-//! change must also be what the writer left; otherwise another program has written to them.
+//! disk. The database and its log are written through the engine alone, so their size and time of
+//! change must also be what the writer left, unless the engine knows of another connection that has
+//! committed since; otherwise another program has written to them.
 //!
 //! What is found is the state of this moment. A directory that is put back, or a disk that can be
 //! written again, is used again; a file that is another one needs a restart.
@@ -25,11 +26,18 @@ pub(super) struct Storage {
     written: [OpenFile; 2],
     /// The others.
     fixed: Vec<OpenFile>,
-    /// How the writer left the files of `written`; locked while it writes. None if they could not
-    /// be looked at then.
-    left: Mutex<Option<[Content; 2]>>,
+    /// How the writer left the files of `written`; locked while it writes.
+    left: Mutex<Left>,
     /// Why the last write failed, if the disk was the reason.
     failed: Mutex<Option<String>>,
+}
+
+/// How the writer left the files that it writes.
+struct Left {
+    /// None if they could not be looked at then.
+    contents: Option<[Content; 2]>,
+    /// The engine's count of what other connections have committed.
+    version: Option<i64>,
 }
 
 /// A file by its name, and which one it was when it was opened.
@@ -92,8 +100,9 @@ fn lost(reason: String) -> StoreError {
 }
 
 impl Storage {
-    /// Remembers the files of `directory`, all of which have just been opened.
-    pub(super) fn watch(directory: &Path) -> Result<Self, StoreError> {
+    /// Remembers the files of `directory`, all of which have just been opened. `version` is the
+    /// engine's count of what other connections have committed.
+    pub(super) fn watch(directory: &Path, version: Option<i64>) -> Result<Self, StoreError> {
         let database = directory.join(DATABASE);
         let log = with_suffix(&database, "-wal");
         let log_index = with_suffix(&database, "-shm");
@@ -112,7 +121,10 @@ impl Storage {
             directory: directory.to_owned(),
             written: [database, log],
             fixed,
-            left: Mutex::new(Some([database_left, log_left])),
+            left: Mutex::new(Left {
+                contents: Some([database_left, log_left]),
+                version,
+            }),
             failed: Mutex::default(),
         })
     }
@@ -143,26 +155,45 @@ impl Storage {
         Ok(contents)
     }
 
-    /// Compares the files with what the writer left.
-    fn compare(&self, left: &Option<[Content; 2]>) -> Result<(), StoreError> {
+    /// Compares the files with what the writer left. `version` asks the engine for its count.
+    fn compare(
+        &self,
+        left: &mut Left,
+        version: &dyn Fn() -> Option<i64>,
+    ) -> Result<(), StoreError> {
         let found = self.look_up()?;
-        let left = left.as_ref().unwrap_or(&found);
-        for ((file, found), left) in self.written.iter().zip(&found).zip(left) {
-            if found != left {
-                return Err(lost(format!(
-                    "another program has written to {}; stop the server, put the right file in \
-                     place, and start again",
-                    file.path.display()
-                )));
-            }
+        let Some(contents) = left.contents.filter(|contents| *contents != found) else {
+            return Ok(());
+        };
+        // Asked after the files were looked at, so that what was seen in them is counted.
+        let version = version();
+        if version.is_some() && version != left.version {
+            *left = Left {
+                contents: Some(found),
+                version,
+            };
+            return Ok(());
         }
-        Ok(())
+        let changed = self.written.iter().zip(found.iter().zip(&contents));
+        let mut changed = changed.filter(|(_, (found, left))| found != left);
+        let path = changed
+            .next()
+            .map_or(&self.directory, |(file, _)| &file.path);
+        Err(lost(format!(
+            "another program has written to {}; stop the server, put the right file in place, and \
+             start again",
+            path.display()
+        )))
     }
 
-    /// Lets the writer write, if the files are as it left them.
-    pub(super) fn begin(&self) -> Result<Writing<'_>, StoreError> {
-        let left = self.left.lock().unwrap_or_else(PoisonError::into_inner);
-        self.compare(&left)?;
+    /// Lets the writer write, if the files are as it left them. `version` asks the engine how much
+    /// other connections have committed.
+    pub(super) fn begin(
+        &self,
+        version: &dyn Fn() -> Option<i64>,
+    ) -> Result<Writing<'_>, StoreError> {
+        let mut left = self.left.lock().unwrap_or_else(PoisonError::into_inner);
+        self.compare(&mut left, version)?;
         Ok(Writing {
             storage: self,
             left,
@@ -171,20 +202,26 @@ impl Storage {
     }
 
     /// As [`Storage::begin`], for folding the log into the database, after which it is cut.
-    pub(super) fn begin_folding(&self) -> Result<Writing<'_>, StoreError> {
-        let mut writing = self.begin()?;
+    pub(super) fn begin_folding(
+        &self,
+        version: &dyn Fn() -> Option<i64>,
+    ) -> Result<Writing<'_>, StoreError> {
+        let mut writing = self.begin(version)?;
         writing.cuts = true;
         Ok(writing)
     }
 
-    /// As the writer would find the files, also while it writes.
-    pub(super) fn check(&self) -> Result<(), StoreError> {
-        match self.left.try_lock() {
-            Ok(left) => self.compare(&left),
-            Err(TryLockError::Poisoned(left)) => self.compare(&left.into_inner()),
+    /// Whether the files are as the writer left them; if not, the writer has to say whether that is
+    /// right. An error if they are not in place.
+    pub(super) fn is_as_left(&self) -> Result<bool, StoreError> {
+        let left = match self.left.try_lock() {
+            Ok(left) => left,
+            Err(TryLockError::Poisoned(left)) => left.into_inner(),
             // What it writes now, it compares itself.
-            Err(TryLockError::WouldBlock) => self.check_names(),
-        }
+            Err(TryLockError::WouldBlock) => return self.check_names().map(|()| true),
+        };
+        let found = self.look_up()?;
+        Ok(left.contents.is_none_or(|contents| contents == found))
     }
 
     /// Remembers whether the disk took the last write.
@@ -207,7 +244,7 @@ impl Storage {
 /// The writer's turn. However it ends, what the files are like then is what the writer left.
 pub(super) struct Writing<'a> {
     storage: &'a Storage,
-    left: MutexGuard<'a, Option<[Content; 2]>>,
+    left: MutexGuard<'a, Left>,
     /// Whether the writer itself makes a file shorter.
     cuts: bool,
 }
@@ -220,7 +257,7 @@ impl Writing<'_> {
     }
 
     fn refuse_cut(&self, found: &[Content; 2]) -> Result<(), StoreError> {
-        let Some(left) = self.left.as_ref().filter(|_| !self.cuts) else {
+        let Some(left) = self.left.contents.as_ref().filter(|_| !self.cuts) else {
             return Ok(());
         };
         for ((file, found), left) in self.storage.written.iter().zip(found).zip(left) {
@@ -236,12 +273,12 @@ impl Writing<'_> {
 impl Drop for Writing<'_> {
     fn drop(&mut self) {
         let Ok(found) = self.storage.contents() else {
-            *self.left = None;
+            self.left.contents = None;
             return;
         };
         // A file that was cut stays noticed: it is not what the writer left.
         if self.refuse_cut(&found).is_ok() {
-            *self.left = Some(found);
+            self.left.contents = Some(found);
         }
     }
 }
@@ -266,6 +303,18 @@ mod tests {
         folder
     }
 
+    /// The engine knows of no other connection that has committed.
+    fn same() -> Option<i64> {
+        Some(1)
+    }
+
+    fn check(storage: &Storage) -> Result<(), StoreError> {
+        let as_writer = storage.begin(&same).map(drop);
+        let is_as_left = storage.is_as_left();
+        assert_eq!(as_writer.is_ok(), matches!(is_as_left, Ok(true)));
+        as_writer
+    }
+
     fn reason(outcome: Result<(), StoreError>) -> String {
         match outcome {
             Err(StoreError::StorageLost { reason }) => reason,
@@ -276,59 +325,73 @@ mod tests {
     #[test]
     fn every_file_is_missed_when_it_is_gone_and_used_again_when_it_is_back() {
         let folder = folder();
-        let storage = Storage::watch(folder.path()).unwrap();
-        storage.check().unwrap();
+        let storage = Storage::watch(folder.path(), Some(1)).unwrap();
+        check(&storage).unwrap();
         for entry in fs::read_dir(folder.path()).unwrap() {
             let path = entry.unwrap().path();
             let aside = folder.path().with_extension("aside");
             fs::rename(&path, &aside).unwrap();
-            assert!(reason(storage.check()).contains(&path.display().to_string()));
-            assert!(storage.begin().is_err());
+            assert!(reason(check(&storage)).contains(&path.display().to_string()));
+            assert!(storage.begin(&same).is_err());
             fs::write(&path, "0123456789").unwrap();
-            assert!(reason(storage.check()).contains("another file"), "{path:?}");
+            assert!(reason(check(&storage)).contains("another file"), "{path:?}");
             fs::rename(&aside, &path).unwrap();
-            storage.check().unwrap();
+            check(&storage).unwrap();
         }
     }
 
     #[test]
     fn what_the_writer_writes_is_its_own_and_what_others_write_is_not() {
         let folder = folder();
-        let storage = Storage::watch(folder.path()).unwrap();
+        let storage = Storage::watch(folder.path(), Some(1)).unwrap();
         let log = folder.path().join("placeformer.db-wal");
-        let writing = storage.begin().unwrap();
+        let writing = storage.begin(&same).unwrap();
         fs::write(&log, "0123456789 and more").unwrap();
         writing.check().unwrap();
-        storage.check().unwrap();
+        assert!(storage.is_as_left().unwrap(), "the writer is at it");
         drop(writing);
-        storage.check().unwrap();
+        check(&storage).unwrap();
         fs::write(&log, "0123456789 and more, but not by the writer").unwrap();
-        assert!(reason(storage.check()).contains("another program"));
+        assert!(reason(check(&storage)).contains("another program"));
+    }
+
+    #[test]
+    fn what_another_connection_of_the_engine_has_committed_is_taken_over() {
+        let folder = folder();
+        let storage = Storage::watch(folder.path(), Some(1)).unwrap();
+        let log = folder.path().join("placeformer.db-wal");
+        fs::write(&log, "another transaction").unwrap();
+        assert!(!storage.is_as_left().unwrap());
+        drop(storage.begin(&|| Some(2)).unwrap());
+        assert!(storage.is_as_left().unwrap());
+        // The same count again explains no further change.
+        fs::write(&log, "no transaction").unwrap();
+        assert!(storage.begin(&|| Some(2)).is_err());
     }
 
     #[test]
     fn a_file_that_is_cut_while_the_writer_writes_stays_noticed() {
         let folder = folder();
-        let storage = Storage::watch(folder.path()).unwrap();
+        let storage = Storage::watch(folder.path(), Some(1)).unwrap();
         let log = folder.path().join("placeformer.db-wal");
-        let writing = storage.begin().unwrap();
+        let writing = storage.begin(&same).unwrap();
         fs::write(&log, "").unwrap();
         assert!(reason(writing.check()).contains("cut"));
         drop(writing);
-        assert!(storage.check().is_err());
+        assert!(check(&storage).is_err());
         // Folding the log into the database is what cuts it otherwise.
         fs::write(&log, "0123456789").unwrap();
-        let storage = Storage::watch(folder.path()).unwrap();
-        let folding = storage.begin_folding().unwrap();
+        let storage = Storage::watch(folder.path(), Some(1)).unwrap();
+        let folding = storage.begin_folding(&same).unwrap();
         fs::write(&log, "").unwrap();
         drop(folding);
-        storage.check().unwrap();
+        check(&storage).unwrap();
     }
 
     #[test]
     fn a_write_that_the_disk_refused_is_remembered_until_one_succeeds() {
         let folder = folder();
-        let storage = Storage::watch(folder.path()).unwrap();
+        let storage = Storage::watch(folder.path(), Some(1)).unwrap();
         storage.wrote(Err(&StoreError::DiskFull));
         assert!(!storage.has_failed());
         storage.wrote(Err(&lost("an I/O error".into())));

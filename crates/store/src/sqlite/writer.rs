@@ -13,7 +13,7 @@
 //! [`MarkFile`] says durably that the commit was made. A commit for which that fails may be in the
 //! database or not; its callers are told that the storage is lost.
 
-use super::engine::failed;
+use super::engine::{data_version, failed};
 use super::job::{Effect, Job, Pending, job};
 use super::mark::{CommitMark, MarkFile};
 use super::purge;
@@ -161,14 +161,14 @@ impl Worker {
 
     /// Folds the log into the database before the connection closes.
     fn close(&self) {
-        let said = self.files.storage.begin().and_then(|_writing| {
+        let said = self.begin().and_then(|_writing| {
             set_closed(&self.connection).map_err(failed("saying that it is closed"))
         });
         if let Err(error) = said {
             tracing::warn!(%error, "the database does not say that it is closed");
         }
         self.checkpoint();
-        if let Err(error) = self.files.storage.check() {
+        if let Err(error) = self.begin() {
             tracing::error!(%error, "the log is left as it is");
             // Closing would remove the log by its name, which may stand for another one by now.
             let keep_log = DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE;
@@ -176,6 +176,15 @@ impl Worker {
                 tracing::error!(%error, "cannot keep the log");
             }
         }
+    }
+
+    /// Lets this thread write, if the storage is in place.
+    fn begin(&self) -> Result<Writing<'_>, StoreError> {
+        self.files.storage.begin(&|| self.version())
+    }
+
+    fn version(&self) -> Option<i64> {
+        data_version(&self.connection)
     }
 
     /// The next job; removes deleted data while there is none.
@@ -215,7 +224,7 @@ impl Worker {
     /// Makes a group durable and answers its callers.
     fn commit(&mut self, jobs: Vec<Box<dyn Job>>) {
         // What follows may write to the directory even before a transaction begins.
-        if let Err(error) = self.files.storage.check() {
+        if let Err(error) = self.begin().map(drop) {
             return refuse(jobs, &reason_of(error));
         }
         let mut admitted = self.admit(jobs);
@@ -281,7 +290,7 @@ impl Worker {
     /// Runs jobs in one transaction and marks it.
     fn attempt(&self, jobs: &mut [Box<dyn Job>]) -> Result<(), Failure> {
         let storage = &self.files.storage;
-        let outcome = storage.begin().map_err(Failure::from).and_then(|writing| {
+        let outcome = self.begin().map_err(Failure::from).and_then(|writing| {
             let progress = self.transact(jobs, &writing)?;
             crash_points::reach(crash_points::AFTER_COMMIT);
             self.acknowledge(&writing, progress)
@@ -400,8 +409,6 @@ impl Worker {
             return;
         }
         let removed = self
-            .files
-            .storage
             .begin()
             .and_then(|_writing| purge::batch(&self.connection));
         match removed {
@@ -417,10 +424,14 @@ impl Worker {
     /// Folds the log into the database as far as readers allow, and cuts it.
     fn checkpoint(&self) {
         let sql = "PRAGMA wal_checkpoint(TRUNCATE)";
-        let folded = self.files.storage.begin_folding().and_then(|_writing| {
-            let folded = self.connection.query_row(sql, [], |_| Ok(()));
-            folded.map_err(failed("folding the log into it"))
-        });
+        let folded = self
+            .files
+            .storage
+            .begin_folding(&|| self.version())
+            .and_then(|_writing| {
+                let folded = self.connection.query_row(sql, [], |_| Ok(()));
+                folded.map_err(failed("folding the log into it"))
+            });
         if let Err(error) = folded {
             tracing::warn!(%error, "cannot fold the log into the database now");
         }
