@@ -168,7 +168,7 @@ fn check(state: &AppState, request: &Request) -> Result<(), ApiError> {
     let info = request.extensions().get::<ConnectionInfo>();
     let is_loopback = info.is_some_and(|info| info.is_loopback);
     let is_tls = info.is_some_and(|info| info.is_tls);
-    let must_be_local = is_loopback && state.api_keys.is_empty();
+    let must_be_local = is_loopback && state.auth().keys.is_empty();
     let rules = &state.cross_origin;
     rules.check_host(request, must_be_local)?;
     rules.check_origin(request, is_tls)

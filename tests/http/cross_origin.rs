@@ -121,7 +121,10 @@ fn with_key(config: &mut Config) {
     config.auth.keys = vec![ApiKey {
         name: "fleet".into(),
         // SHA-256 of "secret".
-        sha256: "2bb80d537b1da3e38bd30361aa855686bde0eacd7162fef6a25fe97bf527a25b".into(),
+        sha256: "2bb80d537b1da3e38bd30361aa855686bde0eacd7162fef6a25fe97bf527a25b"
+            .to_owned()
+            .into(),
+        maps: None,
         role: Role::Write,
         requests_per_second: None,
     }];

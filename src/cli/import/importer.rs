@@ -139,7 +139,7 @@ impl Importer<'_> {
     fn show(&self, name: &str, detail: &str) {
         let line = format!("{name}: {detail}");
         let shown = Printable(line);
-        self.progress.suspend(&mut || eprintln!("{shown}"));
+        self.progress.suspend(&mut || note!("{shown}"));
     }
 
     /// Imports one photo, or brings up to date what the map knows about it.

@@ -171,7 +171,7 @@ fn report_passed_over(report: &ImportReport, scan: &FolderScan) -> anyhow::Resul
     }
     for entry in losses(scan) {
         let detail = entry.reason.detail();
-        eprintln!("{}", Printable(format_args!("{}: {detail}", entry.name)));
+        note!("{}", Printable(format_args!("{}: {detail}", entry.name)));
     }
     Ok(())
 }
@@ -196,11 +196,11 @@ fn read_metadata(args: &ImportArgs, images: &[(String, PathBuf)]) -> anyhow::Res
     if let Some(example) = positions.unmatched.first() {
         let count = positions.unmatched.len();
         let example = Printable(example);
-        eprintln!("{count} rows of the positions file match no photo, such as \"{example}\"");
+        note!("{count} rows of the positions file match no photo, such as \"{example}\"");
     }
     if positions.elsewhere > 0 {
         let count = positions.elsewhere;
-        eprintln!("{count} rows of the positions file are for files outside the folder");
+        note!("{count} rows of the positions file are for files outside the folder");
     }
     Ok(Metadata {
         positions,

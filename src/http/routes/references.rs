@@ -9,10 +9,10 @@ use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use crate::pipeline::{IngestAnswer, IngestRequest};
+use axum::Extension;
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderValue, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
-use axum::Extension;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{
     ExternalId, Heading, MapName, Metadata, ReferenceFields, ReferenceId, Timestamp,

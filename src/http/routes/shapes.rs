@@ -204,7 +204,7 @@ pub async fn timed<T: Serialize>(
     if !header.is_empty()
         && let Ok(value) = HeaderValue::from_str(&header)
     {
-        headers.insert(SERVER_TIMING, value);
+        response.headers_mut().insert(SERVER_TIMING, value);
     }
     Ok(response)
 }

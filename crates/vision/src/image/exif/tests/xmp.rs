@@ -2,6 +2,7 @@
 
 use super::writer::{Container, Exif, Order, Value, jpeg_of};
 use crate::image::{ExifInfo, MetadataBlock, read_exif};
+use placeformer_core::types::Timestamp;
 use proptest::prelude::*;
 use time::macros::datetime;
 
