@@ -63,8 +63,24 @@ pub fn hash_file(path: &Path) -> io::Result<String> {
 /// # Errors
 /// The directory cannot be written to, or the disk is full. The old file is then untouched.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    replace_with(path, |part| write_and_sync(part, bytes))
+}
+
+/// As [`write_atomically`], for a file that others than its owner and its group cannot read.
+///
+/// # Errors
+/// As [`write_atomically`].
+pub fn write_private_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    replace_with(path, |part| {
+        create_private_file(part)?;
+        write_and_sync(part, bytes)
+    })
+}
+
+/// Puts the file that `write` makes in the place of `path`.
+fn replace_with(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> io::Result<()> {
     let part = with_suffix(path, &format!(".{}.part", std::process::id()));
-    let written = write_and_sync(&part, bytes).and_then(|()| rename_durably(&part, path));
+    let written = write(&part).and_then(|()| rename_durably(&part, path));
     if written.is_err() {
         // The unfinished file is of no use to anyone. The caller needs the first error, so a
         // failure to remove it is not reported.

@@ -16,7 +16,7 @@ use super::directory::io;
 use super::sequence::Progress;
 use crate::crash_points;
 use crate::error::StoreError;
-use placeformer_core::files::write_atomically;
+use placeformer_core::files::write_private_atomically;
 use std::fs::{File, OpenOptions};
 use std::io::ErrorKind;
 use std::os::unix::fs::FileExt;
@@ -166,7 +166,7 @@ impl MarkFile {
         // Bytes that are not zero, so that no file system leaves holes that it fills later.
         let mut content = vec![0xff; 2 * SLOT_STRIDE];
         content[mark.offset() as usize..][..SLOT_BYTES].copy_from_slice(&mark.encode());
-        write_atomically(&path, &content).map_err(io("cannot write", &path))?;
+        write_private_atomically(&path, &content).map_err(io("cannot write", &path))?;
         Self::open(directory)
     }
 
