@@ -235,7 +235,7 @@ fn what_stands_beside_the_picture_of_a_webp_does_not_matter() {
 #[test]
 fn an_odd_webp_may_lack_the_byte_that_fills_it_up() {
     let (kind, mut data) = pictures()[0].clone();
-    if data.len() % 2 == 0 {
+    if data.len().is_multiple_of(2) {
         // Bytes behind the compressed data are not read.
         data.push(0);
     }
