@@ -83,6 +83,15 @@ fn what_stands_beside_the_pixels_of_a_png_does_not_matter() {
     }
     let no_end = png(&[header.clone(), pixels.clone()]);
     assert_is_picture(&no_end, &picture(), "without its end");
+    for kept in 1..end.len() {
+        let file = png(&[header.clone(), pixels.clone(), end[..kept].to_vec()]);
+        assert_is_picture(&file, &picture(), "with a part of its end");
+    }
+    let text = chunk(b"tEXt", b"Comment\0hello");
+    for kept in 1..text.len() {
+        let file = png(&[header.clone(), pixels.clone(), text[..kept].to_vec()]);
+        assert_is_picture(&file, &picture(), "cut in its metadata");
+    }
     let more = png(&[header, pixels, end, b"more bytes".to_vec()]);
     assert_is_picture(&more, &picture(), "with bytes behind its end");
 }
@@ -235,7 +244,7 @@ fn what_stands_beside_the_picture_of_a_webp_does_not_matter() {
 #[test]
 fn an_odd_webp_may_lack_the_byte_that_fills_it_up() {
     let (kind, mut data) = pictures()[0].clone();
-    if data.len() % 2 == 0 {
+    if data.len().is_multiple_of(2) {
         // Bytes behind the compressed data are not read.
         data.push(0);
     }

@@ -6,13 +6,21 @@ use super::error::ImageError;
 use super::header::{self, ImageFormat};
 use super::rgb::RgbImage;
 use ::png::{BitDepth, Decoder, DecodingError, Limits, Reader, Transformations};
+use std::borrow::Cow;
 use std::io::Cursor;
 
 const FORMAT: ImageFormat = ImageFormat::Png;
+/// Bytes before the first chunk.
+const SIGNATURE: usize = 8;
+/// Bytes of a chunk's length, kind and checksum.
+const AROUND_DATA: usize = 12;
+/// The last chunk.
+const END: &[u8] = b"\0\0\0\0IEND\xae\x42\x60\x82";
 
 /// Checks the limits, and decodes the picture; of an animation the one for viewers that show none.
 ///
 /// As in viewers, a damaged chunk beside the picture is ignored, and so are bytes behind its end.
+/// The end itself, and metadata before it, may be missing.
 pub(super) fn decode(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, ImageError> {
     let size = header::png_size(bytes)?;
     header::check_size(FORMAT, size, config)?;
@@ -20,7 +28,8 @@ pub(super) fn decode(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, Ima
     let limits = Limits {
         bytes: usize::try_from(limit).unwrap_or(usize::MAX),
     };
-    let mut decoder = Decoder::new_with_limits(Cursor::new(bytes), limits);
+    let whole = with_end(bytes);
+    let mut decoder = Decoder::new_with_limits(Cursor::new(whole.as_ref()), limits);
     decoder.set_ignore_text_chunk(true);
     decoder.set_ignore_iccp_chunk(true);
     decoder.set_transformations(Transformations::EXPAND);
@@ -34,6 +43,29 @@ pub(super) fn decode(bytes: &[u8], config: &ImageConfig) -> Result<RgbImage, Ima
         _ => into_rgb(&samples, channels, 1),
     };
     Ok(RgbImage { size, pixels })
+}
+
+/// The bytes with an end, if nothing but the end or metadata is cut off.
+fn with_end(bytes: &[u8]) -> Cow<'_, [u8]> {
+    let mut at = SIGNATURE;
+    while let Some(head) = bytes.get(at..).and_then(|rest| rest.first_chunk::<8>()) {
+        let [a, b, c, d, kind @ ..] = *head;
+        let length = u32::from_be_bytes([a, b, c, d]) as usize;
+        let next = at.saturating_add(length).saturating_add(AROUND_DATA);
+        let is_end = &kind == b"IEND";
+        if next > bytes.len() {
+            // Without a chunk that matters the picture is incomplete, and the decoder says so.
+            if kind[0].is_ascii_uppercase() && !is_end {
+                return Cow::Borrowed(bytes);
+            }
+            break;
+        }
+        if is_end {
+            return Cow::Borrowed(bytes);
+        }
+        at = next;
+    }
+    Cow::Owned([&bytes[..at.min(bytes.len())], END].concat())
 }
 
 fn samples(reader: &mut Reader<Cursor<&[u8]>>, limit: u64) -> Result<Vec<u8>, ImageError> {

@@ -308,7 +308,7 @@ fn coefficients(samples: &[f32; 64]) -> [i32; 64] {
 static ZIGZAG: LazyLock<[(usize, usize); 64]> = LazyLock::new(|| {
     let mut order: Vec<(usize, usize)> = (0..64).map(|i| (i % 8, i / 8)).collect();
     // Along the diagonals, upwards and downwards in turn.
-    order.sort_by_key(|&(u, v)| (u + v, if (u + v) % 2 == 0 { u } else { v }));
+    order.sort_by_key(|&(u, v)| (u + v, if (u + v).is_multiple_of(2) { u } else { v }));
     order.try_into().unwrap()
 });
 

@@ -113,8 +113,11 @@ pub fn assert_agrees(bytes: &[u8], image: &RgbImage, name: &str) {
         let deviation = placeformer_vision::image::DEVIATION[channel];
         let level = (value * deviation + mean) * 255.0;
         let off = (level - f32::from(small.pixels[3 * pixel + channel])).abs();
+        let ImageSize { width, height } = image.size;
+        let is_whole = width.is_multiple_of(8) && height.is_multiple_of(8);
+        let most = if is_whole { 8.0 } else { 60.0 };
         assert!(
-            off < 14.0,
+            off < most,
             "{name}: reduced, channel {channel} is off by {off}"
         );
     }

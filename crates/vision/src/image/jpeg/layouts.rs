@@ -18,7 +18,8 @@ pub(super) fn simplify(layout: &mut Layout<'_>) -> Result<(), Fault> {
     let largest = frame.largest_sampling();
     for component in &frame.components {
         let (horizontal, vertical) = component.sampling;
-        if !largest.0.is_multiple_of(horizontal) || !largest.1.is_multiple_of(vertical) {
+        let divides = largest.0.is_multiple_of(horizontal) && largest.1.is_multiple_of(vertical);
+        if !divides {
             return Err(unsupported(frame));
         }
     }
