@@ -88,10 +88,6 @@ macro_rules! say_part {
     ($($text:tt)*) => { $crate::cli::output::write(format_args!($($text)*)) };
 }
 
-#[cfg_attr(
-    not(feature = "lab"),
-    allow(unused_imports, reason = "the lab notes most")
-)]
 pub(super) use {note, say, say_part};
 
 #[cfg(test)]
