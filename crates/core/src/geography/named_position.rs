@@ -94,8 +94,17 @@ impl UtmName {
     }
 
     fn disagreement(&self, grid: GeoPoint, geo: GeoPoint) -> Option<String> {
+        let [lat_tolerance, lon_tolerance] = self.geo_tolerance;
+        // As near to the grid's position as the decimals allow.
+        let nearest = |geo: f64, grid: f64, tolerance: f64| {
+            let limit = 2.0 * tolerance;
+            grid.clamp(geo - limit, geo + limit)
+        };
+        let lat = nearest(geo.lat(), grid.lat(), lat_tolerance);
+        let lon = nearest(geo.lon(), grid.lon(), lon_tolerance);
+        let nearest = GeoPoint::new(lat, lon).unwrap_or(geo);
+        let is_far = grid.distance_m(nearest) > DISAGREEMENT_M;
         let distance = grid.distance_m(geo);
-        let is_far = distance > DISAGREEMENT_M.max(2.0 * self.geo_tolerance_m);
         is_far.then(|| {
             format!(
                 "the name's UTM coordinates and its latitude and longitude are {distance:.0} m \

@@ -14,9 +14,6 @@ use crate::invalid::InvalidValue;
 use crate::types::Timestamp;
 use time::{Date, Month, PrimitiveDateTime, Time};
 
-/// Length of a degree of latitude in metres.
-const METRES_PER_DEGREE: f64 = 111_320.0;
-
 /// What a name says.
 #[derive(Debug, Clone, PartialEq)]
 pub struct UtmName {
@@ -28,8 +25,9 @@ pub struct UtmName {
     pub unknown_zone: Option<String>,
     /// Latitude and longitude, where the name spells them out.
     pub geo: Option<GeoPoint>,
-    /// How far these two may be from the truth in metres, because they have only so many decimals.
-    pub(super) geo_tolerance_m: f64,
+    /// How far each of these two may be from the truth in degrees, because they have only so many
+    /// decimals.
+    pub(super) geo_tolerance: [f64; 2],
     /// Identifier of the panorama or frame; empty if absent.
     pub pano_id: String,
     /// Where the camera looked.
@@ -60,7 +58,7 @@ impl UtmName {
             point: MetricPoint { east, north },
             zone,
             unknown_zone: (zone.is_none() && names_both).then(|| format!("{number}{band}")),
-            geo_tolerance_m: tolerance_m(fields.text(4)).max(tolerance_m(fields.text(5))),
+            geo_tolerance: [4, 5].map(|index| last_decimal(fields.text(index))),
             geo: lat
                 .zip(lon)
                 .and_then(|(lat, lon)| GeoPoint::new(lat, lon).ok()),
@@ -73,12 +71,12 @@ impl UtmName {
     }
 }
 
-/// The length of one unit of the last decimal of an angle in degrees, on a meridian.
-fn tolerance_m(degrees: &str) -> f64 {
-    let decimals = degrees
+/// One unit of the last decimal of a number.
+fn last_decimal(number: &str) -> f64 {
+    let decimals = number
         .split_once('.')
         .map_or(0, |(_, decimals)| decimals.len());
-    METRES_PER_DEGREE / 10f64.powi(decimals.min(15) as i32)
+    10f64.powi(-(decimals.min(15) as i32))
 }
 
 /// The parts between the `@` of a file name, without its extension.
