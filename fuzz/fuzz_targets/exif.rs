@@ -3,8 +3,8 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
+use placeformer_core::types::Timestamp;
 use placeformer_vision::image::read_exif;
-use time::format_description::well_known::Rfc3339;
 
 fuzz_target!(|block: &[u8]| {
     let segment = &block[..block.len().min(65_000)];
@@ -24,7 +24,8 @@ fuzz_target!(|block: &[u8]| {
         assert_eq!(info.heading.is_some(), sources.heading.is_some());
         assert_eq!(info.captured_at.is_some(), sources.captured_at.is_some());
         if let Some(time) = info.captured_at {
-            time.format(&Rfc3339).expect("the year is in range");
+            let read: Timestamp = time.to_string().parse().expect("a time can be shown");
+            assert_eq!(read, time);
         }
     }
 });

@@ -8,7 +8,7 @@ use axum::body::Body;
 use axum::http::Request;
 use libfuzzer_sys::fuzz_target;
 use placeformer::http::body::read_upload;
-use placeformer::http::routes::query::QueryParams;
+use placeformer::http::routes::query::{QueryParams, UPLOAD};
 use placeformer::http::{AppState, AuthConfig, HttpConfig};
 use placeformer::ops::{Health, Metrics};
 use std::sync::{Arc, LazyLock};
@@ -49,7 +49,7 @@ fuzz_target!(|bytes: &[u8]| {
         )
         .body(Body::from(body.to_vec()))
         .expect("the request is well formed");
-    let upload = RUNTIME.block_on(read_upload::<QueryParams>(&STATE, request, &["image"]));
+    let upload = RUNTIME.block_on(read_upload::<QueryParams>(&STATE, request, &UPLOAD));
     if let Ok(mut upload) = upload {
         if let Ok(image) = upload.take("image") {
             assert!(!image.is_empty() && image.len() <= body.len());

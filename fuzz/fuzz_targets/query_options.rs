@@ -7,7 +7,7 @@ use libfuzzer_sys::fuzz_target;
 use placeformer::http::body::read_query;
 use placeformer::http::problem::ApiError;
 use placeformer::http::routes::match_images::MatchParams;
-use placeformer::http::routes::ops::ReadyParams;
+use placeformer::http::routes::probes::ReadyParams;
 use placeformer::http::routes::query::QueryParams;
 use placeformer::http::routes::references::{ListParams, Listing, ReferenceParams};
 use serde::de::DeserializeOwned;
