@@ -102,20 +102,23 @@ pub fn assert_shows(bytes: &[u8], layout: &Layout, name: &str) {
 /// Checks that the reduced picture looks like the whole one.
 ///
 /// A reduced picture is a whole number of pixels, so it goes a little beyond one whose sides are no
-/// multiples of the reduction. In these small pictures that shows.
+/// multiples of the reduction. In small pictures that shows, and in tiny ones nothing else does.
 #[track_caller]
 pub fn assert_agrees(bytes: &[u8], image: &RgbImage, name: &str) {
     let tensor = reduced(bytes).unwrap_or_else(|error| panic!("{name}, reduced: {error}"));
     let small = image.resized(TINY).unwrap();
+    let ImageSize { width, height } = image.size;
+    let is_whole = width.is_multiple_of(8) && height.is_multiple_of(8);
+    if !is_whole && width.min(height) < 48 {
+        return;
+    }
+    let most = if is_whole { 8.0 } else { 40.0 };
     for (at, value) in tensor.iter().enumerate() {
         let (channel, pixel) = (at / 4, at % 4);
         let mean = placeformer_vision::image::MEAN[channel];
         let deviation = placeformer_vision::image::DEVIATION[channel];
         let level = (value * deviation + mean) * 255.0;
         let off = (level - f32::from(small.pixels[3 * pixel + channel])).abs();
-        let ImageSize { width, height } = image.size;
-        let is_whole = width.is_multiple_of(8) && height.is_multiple_of(8);
-        let most = if is_whole { 8.0 } else { 60.0 };
         assert!(
             off < most,
             "{name}: reduced, channel {channel} is off by {off}"
