@@ -27,7 +27,7 @@ pub struct HttpConfig {
     /// own. Those are always allowed.
     pub allowed_hosts: Vec<String>,
     /// Origins of web pages that may use the service from a browser, such as
-    /// "https://console.example.com". Pages of other origins than the service's own are refused.
+    /// `https://console.example.com`. Pages of other origins than the service's own are refused.
     pub allowed_origins: Vec<String>,
     /// File of the certificate chain (PEM) for HTTPS, together with tls_key; plain HTTP without. Both
     /// are read again on SIGHUP and when they change; broken files leave the old in force.
