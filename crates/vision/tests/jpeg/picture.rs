@@ -95,7 +95,9 @@ pub fn assert_shows(bytes: &[u8], layout: &Layout, name: &str) {
         }
     }
     let mean = sum / (3 * width * height) as f32;
-    assert!(mean < 5.0, "{name}: off by {mean} on average");
+    // A plane of a quarter of the rows has hardly five in the smallest pictures.
+    let most = if width.min(height) < 20 { 8.0 } else { 5.0 };
+    assert!(mean < most, "{name}: off by {mean} on average");
     assert_agrees(bytes, &image, name);
 }
 

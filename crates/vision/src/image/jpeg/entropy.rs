@@ -7,7 +7,7 @@
 use super::COEFFICIENTS;
 use super::fault::Fault;
 use super::frame::{Frame, Scan, ScanPart, TableInUse};
-use super::huffman::{Bits, HuffmanTable};
+use super::huffman::{Bits, BlockSteps, HuffmanTable};
 
 /// The standard's limit on blocks in a unit of several components. Decoders have buffers for it.
 const MAX_UNIT_BLOCKS: u32 = 10;
@@ -94,6 +94,8 @@ fn behind_restart(data: &[u8], mut at: usize, expected: u8) -> Option<usize> {
 struct BlockTables<'a> {
     dc: Option<HuffmanTable<'a>>,
     ac: Option<HuffmanTable<'a>>,
+    /// In a sequential picture, those of `ac`.
+    steps: Option<Box<BlockSteps>>,
 }
 
 struct ScanDecoder<'a> {
@@ -153,43 +155,52 @@ impl<'a> ScanDecoder<'a> {
     /// Reads the units of one restart interval, up to unit `until`; returns how many bytes they
     /// take.
     fn interval(&mut self, data: &[u8], until: u64) -> Result<usize, Fault> {
-        let mut bits = Bits::new(data);
-        match (self.progressive, self.is_dc, self.is_refinement) {
-            (false, ..) => self.sequential(&mut bits, until)?,
-            (true, true, false) => self.dc_first(&mut bits, until)?,
-            (true, true, true) => {
-                bits.skip_many((until - self.done) * self.unit.len() as u64)?;
-                self.done = until;
-            }
-            (true, false, false) => self.ac_first(&mut bits, until)?,
-            (true, false, true) => self.ac_refinement(&mut bits, until)?,
-        }
+        // The bits are handed over, not lent, so that they stay in registers.
+        let bits = Bits::new(data);
+        let bits = match (self.progressive, self.is_dc, self.is_refinement) {
+            (false, ..) => self.sequential(bits, until)?,
+            (true, true, false) => self.dc_first(bits, until)?,
+            (true, true, true) => self.dc_refinement(bits, until)?,
+            (true, false, false) => self.ac_first(bits, until)?,
+            (true, false, true) => self.ac_refinement(bits, until)?,
+        };
         Ok(bits.bytes_taken())
     }
 
-    fn sequential(&mut self, bits: &mut Bits<'_>, until: u64) -> Result<(), Fault> {
+    fn sequential<'b>(&mut self, mut bits: Bits<'b>, until: u64) -> Result<Bits<'b>, Fault> {
+        let mut unit = Vec::with_capacity(self.unit.len());
+        for &place in &self.unit {
+            let tables = &self.tables[place];
+            let steps = tables.steps.as_deref().ok_or(Fault::BadTable)?;
+            unit.push((tables.dc()?, tables.ac()?, steps));
+        }
         while self.done < until {
-            for &place in &self.unit {
-                let tables = &self.tables[place];
-                dc_difference(bits, tables.dc()?)?;
-                sequential_ac(bits, tables.ac()?)?;
+            for (dc, ac, steps) in &unit {
+                dc_difference(&mut bits, dc)?;
+                bits.skip_block(ac, steps)?;
             }
             self.done += 1;
         }
-        Ok(())
+        Ok(bits)
     }
 
-    fn dc_first(&mut self, bits: &mut Bits<'_>, until: u64) -> Result<(), Fault> {
+    fn dc_first<'b>(&mut self, mut bits: Bits<'b>, until: u64) -> Result<Bits<'b>, Fault> {
         while self.done < until {
             for &place in &self.unit {
-                dc_difference(bits, self.tables[place].dc()?)?;
+                dc_difference(&mut bits, self.tables[place].dc()?)?;
             }
             self.done += 1;
         }
-        Ok(())
+        Ok(bits)
     }
 
-    fn ac_first(&mut self, bits: &mut Bits<'_>, until: u64) -> Result<(), Fault> {
+    fn dc_refinement<'b>(&mut self, mut bits: Bits<'b>, until: u64) -> Result<Bits<'b>, Fault> {
+        bits.skip_many((until - self.done) * self.unit.len() as u64)?;
+        self.done = until;
+        Ok(bits)
+    }
+
+    fn ac_first<'b>(&mut self, mut bits: Bits<'b>, until: u64) -> Result<Bits<'b>, Fault> {
         let table = self.tables[0].ac()?;
         let (first, last) = self.band;
         while self.done < until {
@@ -223,10 +234,10 @@ impl<'a> ScanDecoder<'a> {
             // Viewers do not mind a run that goes on behind the last block.
             self.done = until.min(self.done + 1 + ended);
         }
-        Ok(())
+        Ok(bits)
     }
 
-    fn ac_refinement(&mut self, bits: &mut Bits<'_>, until: u64) -> Result<(), Fault> {
+    fn ac_refinement<'b>(&mut self, mut bits: Bits<'b>, until: u64) -> Result<Bits<'b>, Fault> {
         let table = self.tables[0].ac()?;
         let (first, last) = self.band;
         let mut ended = 0u64;
@@ -267,7 +278,7 @@ impl<'a> ScanDecoder<'a> {
             }
             self.done += 1;
         }
-        Ok(())
+        Ok(bits)
     }
 }
 
@@ -297,29 +308,6 @@ fn dc_difference(bits: &mut Bits<'_>, table: &HuffmanTable<'_>) -> Result<(), Fa
     bits.skip(u32::from(size))
 }
 
-#[inline]
-fn sequential_ac(bits: &mut Bits<'_>, table: &HuffmanTable<'_>) -> Result<(), Fault> {
-    let mut k = 1;
-    while k < COEFFICIENTS {
-        let symbol = bits.symbol(table)?;
-        let (run, size) = (symbol >> 4, symbol & 15);
-        if size == 0 && run < 15 {
-            // Other runs than 0 mean something in progressive pictures only.
-            return if run == 0 {
-                Ok(())
-            } else {
-                Err(Fault::BadSymbol)
-            };
-        }
-        bits.skip(u32::from(size))?;
-        k += usize::from(run) + 1;
-    }
-    if k > COEFFICIENTS {
-        return Err(Fault::Overrun);
-    }
-    Ok(())
-}
-
 /// Which classes of tables the codes of a scan are in.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TablesNeeded {
@@ -344,10 +332,14 @@ fn block_tables<'a>(
         let stored = in_use.table.ok_or(Fault::TableMissing(number))?;
         HuffmanTable::new(stored)
     };
-    Ok(BlockTables {
-        dc: needed.dc.then(|| derive(part.dc)).transpose()?,
-        ac: needed.ac.then(|| derive(part.ac)).transpose()?,
-    })
+    let dc = needed.dc.then(|| derive(part.dc)).transpose()?;
+    let ac = needed.ac.then(|| derive(part.ac)).transpose()?;
+    // Only a sequential scan needs both tables.
+    let steps = ac
+        .as_ref()
+        .filter(|_| needed.dc)
+        .map(|ac| Box::new(BlockSteps::new(ac)));
+    Ok(BlockTables { dc, ac, steps })
 }
 
 impl<'a> BlockTables<'a> {

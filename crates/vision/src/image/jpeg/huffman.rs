@@ -4,7 +4,11 @@ use super::fault::Fault;
 use super::frame::StoredTable;
 
 /// Bits that the table is looked up with. Longer codes are rare.
-const LOOKUP_BITS: u32 = 10;
+const LOOKUP_BITS: u32 = 12;
+/// Coefficients of a block.
+const BLOCK: u32 = super::COEFFICIENTS as u32;
+/// What the code that ends a block advances by: more than any others together.
+const BLOCK_END: u16 = 128;
 
 /// A Huffman table, ready for decoding.
 pub(super) struct HuffmanTable<'a> {
@@ -81,6 +85,52 @@ impl<'a> HuffmanTable<'a> {
         let code = (bits >> (16 - length)) as i32;
         let place = usize::try_from(code + self.offsets[length as usize]).ok()?;
         Some((length, *self.symbols.get(place)?))
+    }
+}
+
+/// For the next bits of a sequential block: how many bits the next code takes together with the
+/// value behind it, in the low byte, and how many coefficients it advances by, in the high one; 0
+/// where a single look-up cannot tell.
+///
+/// Most codes are short, so that one look-up often tells of two.
+pub(super) struct BlockSteps {
+    one: [u16; 1 << LOOKUP_BITS],
+    two: [u16; 1 << LOOKUP_BITS],
+}
+
+impl BlockSteps {
+    pub fn new(table: &HuffmanTable<'_>) -> Self {
+        let one = table.lookup.map(step);
+        let two = std::array::from_fn(|window| {
+            let first = one[window];
+            let taken = u32::from(first & 0xff);
+            if first == 0 || first >> 8 >= BLOCK_END || taken >= LOOKUP_BITS {
+                return first;
+            }
+            let next = (window << taken) & ((1 << LOOKUP_BITS) - 1);
+            let code_bits = u32::from(table.lookup[next] >> 8);
+            let is_known = code_bits + taken <= LOOKUP_BITS;
+            // Both bytes are sums that fit: at most 12 + 15 bits and 16 + 128 coefficients.
+            if is_known && one[next] != 0 {
+                first + one[next]
+            } else {
+                first
+            }
+        });
+        Self { one, two }
+    }
+}
+
+/// The step of an entry of [`HuffmanTable::lookup`].
+fn step(entry: u16) -> u16 {
+    let (run, size) = (entry >> 4 & 15, entry & 15);
+    let bits = (entry >> 8) + size;
+    match (run, size) {
+        _ if entry >> 8 == 0 => 0,
+        (0, 0) => BLOCK_END << 8 | bits,
+        // Other runs than these mean something in progressive pictures only.
+        (1..15, 0) => 0,
+        (run, _) => (run + 1) << 8 | bits,
     }
 }
 
@@ -179,6 +229,51 @@ impl<'a> Bits<'a> {
     #[inline]
     pub fn skip(&mut self, bits: u32) -> Result<(), Fault> {
         self.take(bits)
+    }
+
+    /// Skips the coefficients of a sequential block, but for the first.
+    #[inline]
+    pub fn skip_block(
+        &mut self,
+        table: &HuffmanTable<'_>,
+        steps: &BlockSteps,
+    ) -> Result<(), Fault> {
+        let mut k = 1;
+        while k < BLOCK {
+            self.fill();
+            let window = (self.buffer >> (64 - LOOKUP_BITS)) as usize;
+            // Up to here the first of two codes cannot end the block.
+            let is_early = k <= BLOCK / 2;
+            let step = if is_early {
+                steps.two[window]
+            } else {
+                steps.one[window]
+            };
+            if step == 0 {
+                k += self.skip_long(table)?;
+                continue;
+            }
+            self.take(u32::from(step & 0xff))?;
+            k += u32::from(step >> 8);
+        }
+        if k > BLOCK && k < u32::from(BLOCK_END) {
+            return Err(Fault::Overrun);
+        }
+        Ok(())
+    }
+
+    /// Skips a code that has no step, and the value behind it; returns by how many coefficients it
+    /// advances.
+    #[cold]
+    fn skip_long(&mut self, table: &HuffmanTable<'_>) -> Result<u32, Fault> {
+        // As an entry of the table it says the same of a longer code, whose length is taken already.
+        let symbol = self.symbol(table)?;
+        let step = step(1 << 8 | u16::from(symbol));
+        if step == 0 {
+            return Err(Fault::BadSymbol);
+        }
+        self.skip(u32::from(symbol & 15))?;
+        Ok(u32::from(step >> 8))
     }
 
     /// The next bits, at most 16.
