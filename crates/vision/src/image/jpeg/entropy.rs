@@ -13,8 +13,8 @@ use super::huffman::{Bits, BlockSteps, HuffmanTable};
 const MAX_UNIT_BLOCKS: u32 = 10;
 /// Most bits of a DC difference of 8-bit samples.
 const MAX_DC_BITS: u8 = 11;
-/// Most bits of another coefficient, with those that later scans add. Honest ones have 10; with more
-/// than 15 the sums of some decoders overflow.
+/// Most bits of another coefficient, with those that later scans add. Honest ones have 10; with
+/// more than 15 the sums of some decoders overflow.
 const MAX_AC_BITS: u32 = 15;
 
 /// For each block of a component a bit for each coefficient that is not zero; empty if no scan

@@ -266,7 +266,7 @@ impl<'a> Bits<'a> {
     /// advances.
     #[cold]
     fn skip_long(&mut self, table: &HuffmanTable<'_>) -> Result<u32, Fault> {
-        // As an entry of the table it says the same of a longer code, whose length is taken already.
+        // The length of its code is taken already, so that here any length says the same.
         let symbol = self.symbol(table)?;
         let step = step(1 << 8 | u16::from(symbol));
         if step == 0 {
