@@ -80,6 +80,7 @@ impl Head {
         match &self.aggregate {
             Aggregate::Mean | Aggregate::Gem { .. } => self.dim,
             Aggregate::Vlad(words) => words.dim(),
+            Aggregate::NetVlad(netvlad) => netvlad.dim(),
         }
     }
 
@@ -179,14 +180,21 @@ fn check_shapes(aggregate: &Aggregate, weight: &[f32], bias: &[f32]) -> Result<(
             "a head needs a finite [{GLOBAL_DIM}, d] weight and a [{GLOBAL_DIM}] bias"
         ));
     }
-    if let Aggregate::Vlad(words) = aggregate {
-        let count = words.count();
-        let length = words.values().len();
-        if length != dim {
-            return Err(format!(
-                "weight takes {dim} values, its {count} visual words make {length}"
-            ));
-        }
+    if let Some((count, length)) = words_of(aggregate)
+        && length != dim
+    {
+        return Err(format!(
+            "weight takes {dim} values, its {count} visual words make {length}"
+        ));
     }
     Ok(())
+}
+
+/// The number of visual words of an aggregate that has any, and the length of what they make.
+fn words_of(aggregate: &Aggregate) -> Option<(usize, usize)> {
+    match aggregate {
+        Aggregate::Mean | Aggregate::Gem { .. } => None,
+        Aggregate::Vlad(words) => Some((words.count(), words.values().len())),
+        Aggregate::NetVlad(netvlad) => Some((netvlad.count(), netvlad.count() * netvlad.width())),
+    }
 }
