@@ -54,7 +54,7 @@ mkdir -p heads results
 # With pictures of a third town, every PCA head has lower recall, on photographs and in towns.
 # Triplets need them.
 for aggregate in mean gem vlad; do
-  [ -f "heads/pca-$aggregate.safetensors" ] || "$placeformer" head fit "${flags[@]}" --aggregate "$aggregate" \
+  [ -f "heads/pca-$aggregate.safetensors" ] || "$placeformer" head fit "${flags[@]}" --aggregate "$aggregate" --whitening 0.5 \
     --images train learnt1 learnt2 --out "heads/pca-$aggregate.safetensors"
 done
 [ -f heads/triplets-mean.safetensors ] || {

@@ -10,7 +10,7 @@ use placeformer_core::files::hash_file;
 use placeformer_core::folder::list_images;
 use placeformer_lab::train::{AggregateChoice, fit_head};
 use placeformer_models::open_extractor;
-use placeformer_vision::extract::{Aggregate, ExtractConfig, HeadChoice};
+use placeformer_vision::extract::{Aggregate, ExtractConfig, HeadChoice, NetVladShape, Whitening};
 use std::path::PathBuf;
 
 /// Arguments of this subcommand.
@@ -24,7 +24,7 @@ pub struct HeadArgs {
 #[derive(Debug, Subcommand)]
 #[allow(clippy::large_enum_variant, reason = "one value, parsed once")]
 enum HeadCommand {
-    /// Fit a head without labels: PCA to 256 components with half whitening.
+    /// Fit a head without labels: a partly whitened PCA to 256 components.
     Fit(FitArgs),
     /// Train a head on places with triplets; the same as `train --trainable head`.
     ///
@@ -49,9 +49,20 @@ struct FitArgs {
     /// Power of the generalised mean, 1 to 64; 1 is the mean.
     #[arg(long, default_value_t = 3.0, value_name = "P")]
     gem_p: f32,
-    /// Visual words of a VLAD. Each makes a stored reference 0.8 kB larger with ViT-S.
-    #[arg(long, default_value_t = 16, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
-    words: u16,
+    /// Visual words [default: 16 of a VLAD, 64 of a NetVLAD]. Each makes a stored reference larger
+    /// by the width of its tokens, 0.8 kB for a VLAD with ViT-S.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
+    words: Option<u16>,
+    /// Width to which a NetVLAD projects tokens.
+    #[arg(long, default_value_t = NetVladShape::default().width, value_name = "N")]
+    token_width: usize,
+    /// How strongly tokens of a NetVLAD prefer the word that they are most alike.
+    #[arg(long, default_value_t = NetVladShape::default().sharpness, value_name = "X")]
+    sharpness: f32,
+    /// Power of its standard deviation by which a component is divided: 0 is a plain PCA, 1 whitens
+    /// fully.
+    #[arg(long, default_value_t = Whitening::default().power(), value_name = "POWER")]
+    whitening: f64,
     /// Seed of the draw of tokens that visual words are learnt from.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -69,7 +80,12 @@ enum AggregateKind {
     Gem,
     /// A sum of residuals for each of some visual words.
     Vlad,
+    /// As a VLAD, of projected tokens that each take part in every word.
+    Netvlad,
 }
+
+/// Visual words of a VLAD unless the user says otherwise.
+const VLAD_WORDS: u16 = 16;
 
 /// Runs it.
 pub fn run(args: HeadArgs) -> anyhow::Result<()> {
@@ -85,11 +101,12 @@ fn fit(args: FitArgs) -> anyhow::Result<()> {
         head: HeadChoice::None,
         ..args.model.extract_config()?
     };
-    // A power that cannot be used is refused before the model is loaded.
+    // Powers that cannot be used are refused before the model is loaded.
     let choice = args.aggregate_choice()?;
+    let whitening = Whitening::new(args.whitening).map_err(anyhow::Error::msg)?;
     let progress = ProgressBars::default();
     let extractor = open_extractor(&config, &progress)?;
-    let fitted = fit_head(&extractor, &files, choice, &progress)?;
+    let fitted = fit_head(&extractor, &files, choice, whitening, &progress)?;
     for line in &fitted.unreadable {
         note!("left out: {line}");
     }
@@ -118,9 +135,21 @@ impl FitArgs {
                 AggregateChoice::Given(gem)
             }
             AggregateKind::Vlad => AggregateChoice::Vlad {
-                words: usize::from(self.words),
+                words: usize::from(self.words.unwrap_or(VLAD_WORDS)),
                 seed: self.seed,
             },
+            AggregateKind::Netvlad => {
+                let default = NetVladShape::default();
+                let shape = NetVladShape {
+                    words: self.words.map_or(default.words, usize::from),
+                    width: self.token_width,
+                    sharpness: self.sharpness,
+                };
+                AggregateChoice::NetVlad {
+                    shape,
+                    seed: self.seed,
+                }
+            }
         })
     }
 }

@@ -1,4 +1,4 @@
-//! Fitting a head without labels: a PCA with half whitening of pooled tokens.
+//! Fitting a head without labels: a partly whitened PCA of pooled tokens.
 
 use super::error::TrainError;
 use super::pooled_cache::PooledCache;
@@ -6,7 +6,8 @@ use super::triplets::{Side, TripletSet};
 use placeformer_core::progress::{Progress, Task};
 use placeformer_core::types::ImageTensor;
 use placeformer_vision::extract::{
-    Aggregate, Covariance, Extractor, Head, VladWords, half_whitened_head_of_few, sample_tokens,
+    Aggregate, Covariance, Extractor, Head, NetVlad, NetVladShape, VladWords, Whitening,
+    sample_tokens, whitened_head, whitened_head_of_few,
 };
 use placeformer_vision::image::{ImageConfig, load_tensor};
 use rayon::prelude::*;
@@ -36,6 +37,13 @@ pub enum AggregateChoice {
         /// Seed of the draw of tokens that they are learnt from.
         seed: u64,
     },
+    /// A NetVLAD, whose projection and words are learnt from the images first.
+    NetVlad {
+        /// What it should be.
+        shape: NetVladShape,
+        /// Seed of the draw of tokens that it is learnt from.
+        seed: u64,
+    },
 }
 
 /// A head fitted to images.
@@ -56,19 +64,28 @@ pub fn fit_head(
     extractor: &Extractor,
     files: &[PathBuf],
     choice: AggregateChoice,
+    whitening: Whitening,
     progress: &dyn Progress,
 ) -> Result<FittedHead, TrainError> {
     let mut reader = Reader {
         extractor,
+        whitening,
         progress,
         unreadable: BTreeSet::new(),
     };
     let (head, images) = match choice {
         AggregateChoice::Given(aggregate) => reader.fit_by_covariance(files, aggregate)?,
         AggregateChoice::Vlad { words, seed } => {
-            let words = reader.visual_words(files, words, seed)?;
+            let tokens = reader.sampled_tokens(files, seed)?;
+            let words = VladWords::fit(&tokens, extractor.dim(), words, seed)?;
             let files = spread(files, MOST_LONG_VECTORS);
             reader.fit_by_vectors(&files, Aggregate::Vlad(words))?
+        }
+        AggregateChoice::NetVlad { shape, seed } => {
+            let tokens = reader.sampled_tokens(files, seed)?;
+            let netvlad = NetVlad::fit(&tokens, extractor.dim(), shape, seed)?;
+            let files = spread(files, MOST_LONG_VECTORS);
+            reader.fit_by_vectors(&files, Aggregate::NetVlad(Box::new(netvlad)))?
         }
     };
     Ok(FittedHead {
@@ -81,17 +98,14 @@ pub fn fit_head(
 /// Reads images for a fit, remembering those it cannot.
 struct Reader<'a> {
     extractor: &'a Extractor,
+    whitening: Whitening,
     progress: &'a dyn Progress,
     unreadable: BTreeSet<String>,
 }
 
 impl Reader<'_> {
-    fn visual_words(
-        &mut self,
-        files: &[PathBuf],
-        words: usize,
-        seed: u64,
-    ) -> Result<VladWords, TrainError> {
+    /// Tokens of some of the images, drawn at random, `[n, dim]`.
+    fn sampled_tokens(&mut self, files: &[PathBuf], seed: u64) -> Result<Vec<f32>, TrainError> {
         let dim = self.extractor.dim();
         let mut tokens = Vec::new();
         let mut number = seed;
@@ -103,7 +117,7 @@ impl Reader<'_> {
             }
             Ok(())
         })?;
-        Ok(VladWords::fit(&tokens, dim, words, seed)?)
+        Ok(tokens)
     }
 
     /// A PCA of the covariance matrix, for vectors of a few hundred values.
@@ -122,7 +136,8 @@ impl Reader<'_> {
         let images = covariance.count();
         let notes = self.notes(&aggregate, images);
         let backbone = self.extractor.backbone();
-        let head = covariance.half_whitened_head(aggregate, backbone, notes)?;
+        let whitening = self.whitening;
+        let head = whitened_head(&covariance, whitening, aggregate, backbone, notes)?;
         Ok((head, images))
     }
 
@@ -139,14 +154,16 @@ impl Reader<'_> {
         })?;
         let notes = self.notes(&aggregate, vectors.len());
         let backbone = self.extractor.backbone();
-        let head = half_whitened_head_of_few(&vectors, aggregate, backbone, notes)?;
+        let whitening = self.whitening;
+        let head = whitened_head_of_few(&vectors, whitening, aggregate, backbone, notes)?;
         Ok((head, vectors.len()))
     }
 
     /// How the head was made.
     fn notes(&self, aggregate: &Aggregate, images: usize) -> BTreeMap<String, String> {
         let method = format!(
-            "PCA with half whitening of L2-normalised {} tokens",
+            "PCA, divided by deviations to the power {}, of L2-normalised {} tokens",
+            self.whitening.power(),
             aggregate.kind()
         );
         let input_size = self.extractor.input_size().to_string();
@@ -229,7 +246,7 @@ impl SetTokens {
 }
 
 /// The head that training starts from where none is given: what [`fit_head`] would make of the
-/// training images, each of which counts once even if it is both a query and a database image.
+/// training images with the default whitening, each of which counts once even if it is both a query and a database image.
 ///
 /// # Errors
 /// There are too few images.
@@ -241,19 +258,26 @@ pub fn starting_head(
     let aggregate = extractor.aggregate().clone();
     let backbone = extractor.backbone();
     let notes = BTreeMap::new();
+    let whitening = Whitening::default();
     let dim = aggregate.pooled_dim(extractor.dim());
     let rows = distinct_rows(set, tokens, dim);
     if rows.len() <= dim {
         let rows: Vec<Vec<f32>> = rows.into_iter().map(<[f32]>::to_vec).collect();
-        return Ok(half_whitened_head_of_few(
-            &rows, aggregate, backbone, notes,
+        return Ok(whitened_head_of_few(
+            &rows, whitening, aggregate, backbone, notes,
         )?);
     }
     let mut covariance = Covariance::new(dim);
     for row in rows {
         covariance.add(row);
     }
-    Ok(covariance.half_whitened_head(aggregate, backbone, notes)?)
+    Ok(whitened_head(
+        &covariance,
+        whitening,
+        aggregate,
+        backbone,
+        notes,
+    )?)
 }
 
 /// The tokens of every file once, those of the database first.

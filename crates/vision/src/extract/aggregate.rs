@@ -1,15 +1,16 @@
 //! How the patch tokens of an image become the one vector that the head projects.
 //!
-//! The paper takes their mean (III-A). A head file may ask for one of two alternatives from the
+//! The paper takes their mean (III-A). A head file may ask for one of three alternatives from the
 //! field: the generalised mean (GeM, Radenovic et al. 2018), in which strong activations count
-//! more, and VLAD (Jegou et al. 2010; on such tokens: AnyLoc, 2023), which keeps a sum of residuals
-//! for each visual word.
+//! more; VLAD (Jegou et al. 2010; on such tokens: AnyLoc, 2023), which keeps a sum of residuals for
+//! each visual word; and NetVLAD (Arandjelovic et al. 2016), whose parts can be trained.
 //!
 //! Stores keep the pooled vector, so that a map can be given another head without its images. That
 //! works only for a head with the very same aggregate: a VLAD, for example, cannot be made of the
 //! mean.
 
 use super::global::{l2_normalise, mean_token};
+use super::netvlad::NetVlad;
 use super::vlad::VladWords;
 use sha2::{Digest, Sha256};
 use std::fmt;
@@ -32,6 +33,9 @@ pub enum Aggregate {
     /// keeps 12 kB of half floats, compared to 0.8 kB for a mean and some 117 kB of key patches.
     /// The searched vector has 256 values in any case.
     Vlad(VladWords),
+    /// Sums of residuals of projected tokens to visual words, `[words * width]`, to which every
+    /// token contributes by its likeness with the word.
+    NetVlad(Box<NetVlad>),
 }
 
 impl Aggregate {
@@ -55,6 +59,7 @@ impl Aggregate {
             Self::Mean => "mean",
             Self::Gem { .. } => "gem",
             Self::Vlad(_) => "vlad",
+            Self::NetVlad(_) => "netvlad",
         }
     }
 
@@ -63,6 +68,7 @@ impl Aggregate {
         match self {
             Self::Mean | Self::Gem { .. } => dim,
             Self::Vlad(words) => words.values().len(),
+            Self::NetVlad(netvlad) => netvlad.count() * netvlad.width(),
         }
     }
 
@@ -72,9 +78,17 @@ impl Aggregate {
             Self::Mean => mean_token(tokens, dim),
             Self::Gem { p } => generalised_mean(tokens, dim, f64::from(*p)),
             Self::Vlad(words) => words.residuals(tokens),
+            Self::NetVlad(netvlad) => netvlad.residuals(tokens),
         };
         l2_normalise(&mut pooled);
         pooled
+    }
+
+    /// The first digits of the hash of its parameters.
+    fn short_hash(&self) -> String {
+        let mut hasher = Sha256::new();
+        self.hash_into(&mut hasher);
+        hex::encode(hasher.finalize())[..8].to_owned()
     }
 
     /// Adds its parameters to the hash of a head. The mean adds nothing, so that heads made before
@@ -90,22 +104,21 @@ impl Aggregate {
                 hasher.update(b"vlad");
                 hasher.update(bytemuck::cast_slice::<f32, u8>(words.values()));
             }
+            Self::NetVlad(netvlad) => netvlad.hash_into(hasher),
         }
     }
 }
 
-/// `mean`, `gem3`, or `vlad16-0f1e2d3c` (number of words, and the start of their hash). Equal text
-/// means equal pooled vectors.
+/// `mean`, `gem3`, or `vlad16-0f1e2d3c` (number of words, and the start of the hash of all parts).
+/// Equal text means equal pooled vectors.
 impl fmt::Display for Aggregate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Mean => f.write_str("mean"),
             Self::Gem { p } => write!(f, "gem{p}"),
-            Self::Vlad(words) => {
-                let mut hasher = Sha256::new();
-                self.hash_into(&mut hasher);
-                let hash = hex::encode(hasher.finalize());
-                write!(f, "vlad{}-{}", words.count(), &hash[..8])
+            Self::Vlad(words) => write!(f, "vlad{}-{}", words.count(), self.short_hash()),
+            Self::NetVlad(netvlad) => {
+                write!(f, "netvlad{}-{}", netvlad.count(), self.short_hash())
             }
         }
     }
@@ -132,6 +145,7 @@ fn signed_power(x: f64, p: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::extract::netvlad::NetVladParameters;
     use proptest::prelude::*;
 
     fn tokens() -> impl Strategy<Value = Vec<f32>> {
@@ -142,12 +156,23 @@ mod tests {
         a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5)
     }
 
-    fn kinds() -> [Aggregate; 3] {
-        let words = (0..8).map(|i| ((i * 5) % 7) as f32 / 7.0 - 0.4).collect();
+    fn kinds() -> [Aggregate; 4] {
+        let some = |count| -> Vec<f32> {
+            (0..count)
+                .map(|i| ((i * 5) % 7) as f32 / 7.0 - 0.4)
+                .collect()
+        };
+        let netvlad = NetVlad::new(NetVladParameters {
+            mean: some(4),
+            projection: some(8),
+            words: some(6),
+            assignment: some(6),
+        });
         [
             Aggregate::Mean,
             Aggregate::gem(3.0).unwrap(),
-            Aggregate::Vlad(VladWords::new(words, 4).unwrap()),
+            Aggregate::Vlad(VladWords::new(some(8), 4).unwrap()),
+            Aggregate::NetVlad(Box::new(netvlad.unwrap())),
         ]
     }
 
@@ -205,6 +230,7 @@ mod tests {
         let texts = kinds().map(|aggregate| aggregate.to_string());
         assert_eq!(texts[..2], ["mean", "gem3"]);
         assert!(texts[2].starts_with("vlad2-"));
+        assert!(texts[3].starts_with("netvlad3-"));
         let other = Aggregate::Vlad(VladWords::new(vec![0.5; 8], 4).unwrap()).to_string();
         assert_ne!(texts[2], other);
     }

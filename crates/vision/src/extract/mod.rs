@@ -15,13 +15,15 @@
 //!
 //! ```text
 //! extractor -> model_id, selection, trace, fused -> vit -> weights, positions, encoder
-//! model_id, pca -> head -> aggregate -> vlad -> global
+//! model_id, pca -> head -> aggregate -> netvlad -> vlad -> global
+//! pca, netvlad -> components
 //! config -> encoder -> preset
 //! all of them -> error
 //! ```
 
 mod activation;
 mod aggregate;
+mod components;
 mod config;
 mod encoder;
 mod error;
@@ -31,6 +33,7 @@ mod fusion;
 mod global;
 mod head;
 mod model_id;
+mod netvlad;
 mod packing;
 mod pca;
 mod positions;
@@ -44,6 +47,7 @@ mod vlad;
 mod weights;
 
 pub use aggregate::Aggregate;
+pub use components::Covariance;
 pub use config::{ExtractConfig, HeadChoice};
 pub use encoder::{
     EncodedImage, Encoder, EncoderSpec, Precision, TokenGrid, check_image, token_grid,
@@ -54,8 +58,9 @@ pub use fused::{FusedEncoder, mixed_int8_blocks};
 pub use fusion::{attention_map, average_pool};
 pub use global::{l2_normalise, mean_token, squared_distance};
 pub use head::Head;
+pub use netvlad::{NetVlad, NetVladParameters, NetVladShape};
 pub use packing::pack;
-pub use pca::{Covariance, half_whitened_head_of_few};
+pub use pca::{Whitening, whitened_head, whitened_head_of_few};
 pub use positions::interpolate as interpolate_positions;
 pub use preset::{Geometry, LAYER_NORM_EPS, Preset};
 pub use record::{Record, verify as verify_weights};

@@ -1,17 +1,13 @@
-//! Fits a head without labels: a PCA of pooled tokens to 256 components, half whitened.
+//! Fits a head without labels: a PCA of pooled tokens to 256 components, partly whitened.
 //!
 //! In plain PCA a few strong components decide every distance. Full whitening gives all components
-//! the same variance, and so amplifies the noise in the weak ones. Half whitening lies between: a
-//! component is divided by the square root of its standard deviation.
-//!
-//! The covariance is gathered image by image, so the memory needed does not depend on the number of
-//! images. For vectors that are longer than there are images ([`half_whitened_head_of_few`]), the
-//! components come from the matrix of inner products instead, which is smaller than the covariance.
+//! the same variance, and so amplifies the noise in the weak ones. What helps lies between: a
+//! component is divided by its standard deviation to the power of the [`Whitening`].
 
 use super::aggregate::Aggregate;
+use super::components::{Components, Covariance};
 use super::error::ExtractError;
 use super::head::Head;
-use nalgebra::{DMatrix, SymmetricEigen};
 use placeformer_core::types::GLOBAL_DIM;
 use std::collections::BTreeMap;
 
@@ -19,135 +15,70 @@ use std::collections::BTreeMap;
 /// They are scaled as if they had that much, so that the noise is not amplified.
 const LEAST_VARIANCE: f64 = 1e-9;
 
-/// Mean and covariance of vectors seen one at a time (Welford's update, in f64).
-#[derive(Debug, Clone)]
-pub struct Covariance {
-    count: usize,
-    mean: Vec<f64>,
-    /// Sum of the outer products of deviations, `[dim, dim]` row-major; only the lower triangle is
-    /// filled.
-    scatter: Vec<f64>,
-}
+/// The power of its standard deviation by which a component is divided: 0 leaves a plain PCA, 1
+/// whitens fully.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Whitening(f64);
 
-impl Covariance {
-    /// An accumulator for vectors of length `dim`.
-    pub fn new(dim: usize) -> Self {
-        Self {
-            count: 0,
-            mean: vec![0.0; dim],
-            scatter: vec![0.0; dim * dim],
-        }
-    }
-
-    /// Adds one vector.
-    ///
-    /// # Panics
-    /// If it has another length than the others.
-    pub fn add(&mut self, vector: &[f32]) {
-        let dim = self.mean.len();
-        assert_eq!(vector.len(), dim, "all vectors have one length");
-        self.count += 1;
-        let count = self.count as f64;
-        let deviations: Vec<f64> = vector
-            .iter()
-            .zip(&self.mean)
-            .map(|(&value, mean)| f64::from(value) - mean)
-            .collect();
-        for (mean, deviation) in self.mean.iter_mut().zip(&deviations) {
-            *mean += deviation / count;
-        }
-        let shrink = (count - 1.0) / count;
-        for (i, row) in self.scatter.chunks_exact_mut(dim).enumerate() {
-            let factor = deviations[i] * shrink;
-            for (sum, deviation) in row[..=i].iter_mut().zip(&deviations) {
-                *sum += factor * deviation;
-            }
-        }
-    }
-
-    /// Number of vectors seen.
-    pub fn count(&self) -> usize {
-        self.count
-    }
-
-    fn matrix(&self) -> DMatrix<f64> {
-        let dim = self.mean.len();
-        let degrees_of_freedom = (self.count.max(2) - 1) as f64;
-        DMatrix::from_fn(dim, dim, |row, column| {
-            let lower = row.max(column) * dim + row.min(column);
-            self.scatter[lower] / degrees_of_freedom
-        })
-    }
-
-    /// The head for `backbone` whose rows are the 256 strongest components, each divided by the
-    /// square root of its standard deviation. `aggregate` says how the vectors were pooled.
-    ///
-    /// The sign of a component is arbitrary; it is fixed so that the largest entry is positive.
-    /// Equal input therefore gives an equal file.
+impl Whitening {
+    /// A power from 0 to 1.
     ///
     /// # Errors
-    /// [`ExtractError::TooFewImages`] for 256 vectors or fewer.
-    pub fn half_whitened_head(
-        &self,
-        aggregate: Aggregate,
-        backbone: &str,
-        notes: BTreeMap<String, String>,
-    ) -> Result<Head, ExtractError> {
-        check_count(self.count)?;
-        let eigen = SymmetricEigen::new(self.matrix());
-        let mut components = Vec::with_capacity(GLOBAL_DIM);
-        for index in strongest(eigen.eigenvalues.as_slice()) {
-            let column = eigen.eigenvectors.column(index);
-            components.push(Component {
-                variance: eigen.eigenvalues[index],
-                direction: column.iter().copied().collect(),
-            });
+    /// A sentence for people, if it is no such power.
+    pub fn new(power: f64) -> Result<Self, String> {
+        if (0.0..=1.0).contains(&power) {
+            Ok(Self(power))
+        } else {
+            Err(format!("whitening is a power from 0 to 1, not {power}"))
         }
-        half_whitened(&self.mean, &components, aggregate, backbone, notes)
+    }
+
+    /// The power.
+    pub fn power(self) -> f64 {
+        self.0
     }
 }
 
-/// As [`Covariance::half_whitened_head`], for vectors that are longer than there are images.
-/// `vectors` have one length.
-///
-/// The components are found through the `[n, n]` matrix of inner products, which has the same
-/// eigenvalues as the `[dim, dim]` covariance.
+/// Three quarters, which found more places of a city than a half or all of it, whatever the
+/// aggregate.
+impl Default for Whitening {
+    fn default() -> Self {
+        Self(0.75)
+    }
+}
+
+/// The head for `backbone` whose rows are the 256 strongest components of the vectors that
+/// `covariance` has seen, each divided as `whitening` says. `aggregate` says how the vectors were
+/// pooled.
 ///
 /// # Errors
 /// [`ExtractError::TooFewImages`] for 256 vectors or fewer.
-pub fn half_whitened_head_of_few(
+pub fn whitened_head(
+    covariance: &Covariance,
+    whitening: Whitening,
+    aggregate: Aggregate,
+    backbone: &str,
+    notes: BTreeMap<String, String>,
+) -> Result<Head, ExtractError> {
+    check_count(covariance.count())?;
+    let components = Components::of(covariance, GLOBAL_DIM);
+    whitened(&components, whitening, aggregate, backbone, notes)
+}
+
+/// As [`whitened_head`], for `vectors` of one length that are longer than there are images.
+///
+/// # Errors
+/// As [`whitened_head`].
+pub fn whitened_head_of_few(
     vectors: &[Vec<f32>],
+    whitening: Whitening,
     aggregate: Aggregate,
     backbone: &str,
     notes: BTreeMap<String, String>,
 ) -> Result<Head, ExtractError> {
     check_count(vectors.len())?;
-    let count = vectors.len();
-    let dim = vectors[0].len();
-    let mut rows = DMatrix::from_fn(count, dim, |row, column| f64::from(vectors[row][column]));
-    let mean: Vec<f64> = rows.column_iter().map(|column| column.mean()).collect();
-    for (mut column, mean) in rows.column_iter_mut().zip(&mean) {
-        column.add_scalar_mut(-mean);
-    }
-
-    let eigen = SymmetricEigen::new(&rows * rows.transpose() / (count - 1) as f64);
-    let mut components = Vec::with_capacity(GLOBAL_DIM);
-    for index in strongest(eigen.eigenvalues.as_slice()) {
-        let direction = rows.tr_mul(&eigen.eigenvectors.column(index));
-        let length = direction.norm().max(f64::MIN_POSITIVE);
-        components.push(Component {
-            variance: eigen.eigenvalues[index],
-            direction: direction.iter().map(|value| value / length).collect(),
-        });
-    }
-    half_whitened(&mean, &components, aggregate, backbone, notes)
-}
-
-/// A principal component.
-struct Component {
-    variance: f64,
-    /// A unit vector, `[dim]`.
-    direction: Vec<f64>,
+    let components = Components::of_few(vectors, GLOBAL_DIM);
+    whitened(&components, whitening, aggregate, backbone, notes)
 }
 
 /// Fewer vectors than this span fewer than 256 directions.
@@ -162,29 +93,22 @@ fn check_count(images: usize) -> Result<(), ExtractError> {
     }
 }
 
-/// Indices of the 256 largest variances, largest first.
-fn strongest(variances: &[f64]) -> Vec<usize> {
-    let mut order: Vec<usize> = (0..variances.len()).collect();
-    order.sort_by(|&a, &b| variances[b].total_cmp(&variances[a]));
-    order.truncate(GLOBAL_DIM);
-    order
-}
-
-/// The head of `components`, which come strongest first.
-fn half_whitened(
-    mean: &[f64],
-    components: &[Component],
+/// The head whose rows are `components`.
+fn whitened(
+    components: &Components,
+    whitening: Whitening,
     aggregate: Aggregate,
     backbone: &str,
     notes: BTreeMap<String, String>,
 ) -> Result<Head, ExtractError> {
-    let strongest = components.first().map_or(0.0, |first| first.variance);
-    let least = strongest * LEAST_VARIANCE;
+    let Components { mean, strongest } = components;
+    let largest = strongest.first().map_or(0.0, |first| first.variance);
+    let least = largest * LEAST_VARIANCE;
     let mut weight = Vec::with_capacity(GLOBAL_DIM * mean.len());
     let mut bias = Vec::with_capacity(GLOBAL_DIM);
-    for component in components {
+    for component in strongest {
         let direction = &component.direction;
-        let scale = sign_of(direction) * component.variance.max(least).powf(-0.25);
+        let scale = component.variance.max(least).powf(-0.5 * whitening.0);
         weight.extend(direction.iter().map(|value| (value * scale) as f32));
         let projected_mean: f64 = direction
             .iter()
@@ -196,13 +120,6 @@ fn half_whitened(
     Head::new(aggregate, weight, bias, backbone, notes)
 }
 
-/// The sign of the entry of the largest magnitude.
-fn sign_of(direction: &[f64]) -> f64 {
-    let magnitude = |a: &f64, b: &f64| a.abs().total_cmp(&b.abs());
-    let largest = direction.iter().copied().max_by(magnitude);
-    largest.unwrap_or(1.0).signum()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -210,6 +127,8 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     const DIM: usize = 300;
+
+    const HALF: Whitening = Whitening(0.5);
 
     /// Vectors whose coordinate i has deviation 1 / (1 + i) around a mean of i.
     fn sample(count: usize) -> Vec<Vec<f32>> {
@@ -225,31 +144,11 @@ mod tests {
     }
 
     #[test]
-    fn the_streamed_covariance_is_the_covariance() {
-        let vectors = sample(50);
-        let mut streamed = Covariance::new(DIM);
-        vectors.iter().for_each(|v| streamed.add(v));
-        let mean = |i: usize| vectors.iter().map(|v| v[i] as f64).sum::<f64>() / 50.0;
-        for (r, c) in [(0, 0), (3, 1), (1, 3), (299, 299)] {
-            let mr = mean(r);
-            let mc = mean(c);
-            let direct = vectors
-                .iter()
-                .map(|v| (v[r] as f64 - mr) * (v[c] as f64 - mc))
-                .sum::<f64>()
-                / 49.0;
-            assert!((streamed.matrix()[(r, c)] - direct).abs() < 1e-10);
-        }
-    }
-
-    #[test]
     fn components_are_centred_uncorrelated_and_half_whitened() {
         let vectors = sample(2000);
         let mut covariance = Covariance::new(DIM);
         vectors.iter().for_each(|v| covariance.add(v));
-        let head = covariance
-            .half_whitened_head(Aggregate::Mean, "x", BTreeMap::new())
-            .unwrap();
+        let head = whitened_head(&covariance, HALF, Aggregate::Mean, "x", BTreeMap::new()).unwrap();
         let outputs: Vec<Vec<f64>> = vectors.iter().map(|v| head.affine(v)).collect();
         let moment = |a: usize, b: usize| outputs.iter().map(|o| o[a] * o[b]).sum::<f64>() / 1999.0;
         let centre = outputs.iter().map(|o| o[0]).sum::<f64>() / 2000.0;
@@ -266,11 +165,10 @@ mod tests {
         let vectors = sample(280);
         let mut covariance = Covariance::new(DIM);
         vectors.iter().for_each(|v| covariance.add(v));
-        let direct = covariance
-            .half_whitened_head(Aggregate::Mean, "x", BTreeMap::new())
-            .unwrap();
+        let direct =
+            whitened_head(&covariance, HALF, Aggregate::Mean, "x", BTreeMap::new()).unwrap();
         let few =
-            half_whitened_head_of_few(&vectors, Aggregate::Mean, "x", BTreeMap::new()).unwrap();
+            whitened_head_of_few(&vectors, HALF, Aggregate::Mean, "x", BTreeMap::new()).unwrap();
         // The weak components have nearly equal variances, so rounding may mix them. The strong
         // ones differ clearly and must agree.
         for vector in &vectors[..20] {
@@ -284,18 +182,39 @@ mod tests {
             );
         }
         assert!(
-            half_whitened_head_of_few(&vectors[..256], Aggregate::Mean, "x", BTreeMap::new())
+            whitened_head_of_few(&vectors[..256], HALF, Aggregate::Mean, "x", BTreeMap::new())
                 .is_err()
         );
+    }
+
+    #[test]
+    fn full_whitening_gives_every_component_the_same_variance() {
+        let vectors = sample(2000);
+        let mut covariance = Covariance::new(DIM);
+        vectors.iter().for_each(|v| covariance.add(v));
+        let head = whitened_head(
+            &covariance,
+            Whitening(1.0),
+            Aggregate::Mean,
+            "x",
+            BTreeMap::new(),
+        )
+        .unwrap();
+        let outputs: Vec<Vec<f64>> = vectors.iter().map(|v| head.affine(v)).collect();
+        for component in [0, 5, 50, 200] {
+            let variance = outputs.iter().map(|o| o[component].powi(2)).sum::<f64>() / 1999.0;
+            assert!((variance - 1.0).abs() < 1e-2, "{component}: {variance}");
+        }
+        assert!(Whitening::new(1.5).is_err());
+        assert!(Whitening::new(f64::NAN).is_err());
     }
 
     #[test]
     fn too_few_images_are_refused() {
         let mut covariance = Covariance::new(DIM);
         sample(256).iter().for_each(|v| covariance.add(v));
-        let error = covariance
-            .half_whitened_head(Aggregate::Mean, "x", BTreeMap::new())
-            .unwrap_err();
+        let error =
+            whitened_head(&covariance, HALF, Aggregate::Mean, "x", BTreeMap::new()).unwrap_err();
         assert!(error.to_string().contains("more than 256"), "{error}");
     }
 }

@@ -18,7 +18,7 @@ const MOST_ROUNDS: usize = 100;
 
 /// Largest length of a visual word. Words are means of tokens of unit length, so that theirs is at
 /// most 1. All residuals to a word that is far away point in one direction, whatever the image.
-const LONGEST_WORD: f64 = 10.0;
+pub(super) const LONGEST_WORD: f64 = 10.0;
 
 /// The visual words of a VLAD.
 #[derive(Debug, Clone, PartialEq)]

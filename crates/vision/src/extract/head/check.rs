@@ -33,16 +33,23 @@ pub(super) fn shapes(aggregate: &Aggregate, weight: &[f32], bias: &[f32]) -> Res
             "a head needs a finite [{GLOBAL_DIM}, d] weight and a [{GLOBAL_DIM}] bias"
         ));
     }
-    if let Aggregate::Vlad(words) = aggregate {
-        let count = words.count();
-        let length = words.values().len();
-        if length != dim {
-            return Err(format!(
-                "weight takes {dim} values, its {count} visual words make {length}"
-            ));
-        }
+    if let Some((count, length)) = words_of(aggregate)
+        && length != dim
+    {
+        return Err(format!(
+            "weight takes {dim} values, its {count} visual words make {length}"
+        ));
     }
     Ok(())
+}
+
+/// The number of visual words of an aggregate that has any, and the length of what they make.
+fn words_of(aggregate: &Aggregate) -> Option<(usize, usize)> {
+    match aggregate {
+        Aggregate::Mean | Aggregate::Gem { .. } => None,
+        Aggregate::Vlad(words) => Some((words.count(), words.values().len())),
+        Aggregate::NetVlad(netvlad) => Some((netvlad.count(), netvlad.count() * netvlad.width())),
+    }
 }
 
 /// Says which number cannot be computed with, or which row does not depend on the image. The

@@ -3,12 +3,15 @@
 //! A head is a small safetensors file: `weight` `[256, d]`, `bias` `[256]`, and metadata. The
 //! metadata `backbone` says which backbone's tokens the head was fitted to, and `aggregate` how
 //! they are pooled: `mean` (also if it is missing); `gem`, with its power in a tensor `gem_p`
-//! `[1]`; or `vlad`, with its visual words in a tensor `vlad_words` `[k, token width]`, for which d
-//! is k times that width. All other metadata are notes for people.
+//! `[1]`; `vlad`, with its visual words in a tensor `vlad_words` `[k, token width]`, for which d is
+//! k times that width; or `netvlad`, with the tensors `netvlad_mean` `[token width]`,
+//! `netvlad_projection` `[w, token width]`, `netvlad_words` and `netvlad_assignment` `[k, w]`, for
+//! which d is k times w. All other metadata are notes for people.
 
 use super::projection::Head;
 use crate::extract::aggregate::Aggregate;
 use crate::extract::error::ExtractError;
+use crate::extract::netvlad::{NetVlad, NetVladParameters};
 use crate::extract::tensor_file::{TensorFile, to_f32};
 use crate::extract::vlad::VladWords;
 use placeformer_core::files::write_atomically;
@@ -27,6 +30,14 @@ pub(super) const GEM_P: &str = "gem_p";
 
 /// Name of the tensor with the visual words of a VLAD.
 pub(super) const VLAD_WORDS: &str = "vlad_words";
+
+/// Names of the tensors of a NetVLAD: mean, projection, words, assignment.
+pub(super) const NETVLAD: [&str; 4] = [
+    "netvlad_mean",
+    "netvlad_projection",
+    "netvlad_words",
+    "netvlad_assignment",
+];
 
 /// Stands for any positive length in the shape that a tensor must have.
 const ANY: usize = 0;
@@ -105,6 +116,19 @@ impl Head {
                 let shape = [words.count(), words.dim()];
                 tensors.push((VLAD_WORDS, view(&shape, words.values()).map_err(bad)?));
             }
+            Aggregate::NetVlad(netvlad) => {
+                let parts = netvlad.parameters();
+                let words = [netvlad.count(), netvlad.width()];
+                let views = [
+                    view(&[netvlad.dim()], &parts.mean),
+                    view(&[netvlad.width(), netvlad.dim()], &parts.projection),
+                    view(&words, &parts.words),
+                    view(&words, &parts.assignment),
+                ];
+                for (name, view) in NETVLAD.into_iter().zip(views) {
+                    tensors.push((name, view.map_err(bad)?));
+                }
+            }
         }
 
         let mut metadata: HashMap<String, String> = self.notes().clone().into_iter().collect();
@@ -122,15 +146,17 @@ fn view<'a>(shape: &[usize], values: &'a [f32]) -> Result<TensorView<'a>, SafeTe
 
 /// The aggregate of this kind. Refuses tensors that a head of this kind does not have.
 fn read_aggregate(file: &TensorFile<'_>, kind: &str) -> Result<Aggregate, ExtractError> {
-    let known: &[&str] = match kind {
-        "mean" => &["weight", "bias"],
-        "gem" => &["weight", "bias", GEM_P],
-        "vlad" => &["weight", "bias", VLAD_WORDS],
+    let of_kind: &[&str] = match kind {
+        "mean" => &[],
+        "gem" => &[GEM_P],
+        "vlad" => &[VLAD_WORDS],
+        "netvlad" => &NETVLAD,
         _ => {
-            let reason = format!("its aggregate {kind:?} is not one of mean, gem, vlad");
+            let reason = format!("its aggregate {kind:?} is not one of mean, gem, vlad, netvlad");
             return Err(file.bad(reason));
         }
     };
+    let known = [&["weight", "bias"], of_kind].concat();
     let names = file.tensors.names();
     if let Some(name) = names.into_iter().find(|name| !known.contains(name)) {
         let known = known.join(", ");
@@ -151,8 +177,30 @@ fn read_aggregate(file: &TensorFile<'_>, kind: &str) -> Result<Aggregate, Extrac
             let words = VladWords::new(values, dim).map_err(|reason| file.bad(reason))?;
             Ok(Aggregate::Vlad(words))
         }
+        "netvlad" => {
+            let parts = read_netvlad(file)?;
+            let netvlad = NetVlad::new(parts).map_err(|reason| file.bad(reason))?;
+            Ok(Aggregate::NetVlad(Box::new(netvlad)))
+        }
         _ => Ok(Aggregate::Mean),
     }
+}
+
+/// The parts of a NetVLAD, whose shapes must fit each other.
+fn read_netvlad(file: &TensorFile<'_>) -> Result<NetVladParameters, ExtractError> {
+    let [mean, projection, words, assignment] = NETVLAD;
+    let mean = read_tensor(file, mean, &[ANY])?;
+    let projection = read_tensor(file, projection, &[ANY, mean.len()])?;
+    let width = projection.len() / mean.len();
+    let words = read_tensor(file, words, &[ANY, width])?;
+    let count = words.len() / width;
+    let assignment = read_tensor(file, assignment, &[count, width])?;
+    Ok(NetVladParameters {
+        mean,
+        projection,
+        words,
+        assignment,
+    })
 }
 
 /// The values of a tensor of `shape`, in which [`ANY`] stands for any positive length.

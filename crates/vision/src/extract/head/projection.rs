@@ -86,6 +86,7 @@ impl Head {
         match &self.aggregate {
             Aggregate::Mean | Aggregate::Gem { .. } => self.dim,
             Aggregate::Vlad(words) => words.dim(),
+            Aggregate::NetVlad(netvlad) => netvlad.dim(),
         }
     }
 
