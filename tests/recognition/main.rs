@@ -12,5 +12,6 @@ mod image_exif;
 mod image_golden;
 mod image_inputs;
 mod image_limits;
+mod jpeg;
 mod pictures;
 mod town;

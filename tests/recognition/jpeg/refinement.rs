@@ -1,7 +1,7 @@
 //! The scans that add one bit to coefficients (ITU-T T.81, G.1.2.3).
 
-use crate::bits::Bits;
-use crate::encoder::{Scan, end_run};
+use crate::jpeg::bits::Bits;
+use crate::jpeg::encoder::{Scan, end_run};
 
 pub struct Refinement {
     bits: Bits,

@@ -1,9 +1,9 @@
 //! A JPEG encoder that writes every layout: sequential or progressive, interleaved or not, with any
 //! sampling factors, with or without restart markers. It is slow and simple.
 
-use crate::bits::{Bits, size};
-use crate::picture::{Colours, value};
-use crate::refinement::Refinement;
+use crate::jpeg::bits::{Bits, size};
+use crate::jpeg::picture::{Colours, value};
+use crate::jpeg::refinement::Refinement;
 use placeformer_core::types::ImageSize;
 use std::f32::consts::PI;
 use std::sync::LazyLock;

@@ -23,12 +23,12 @@ impl Bits {
         }
     }
 
-    /// A symbol of the DC tables of [`crate::encoder`]: its code has four bits.
+    /// A symbol of the DC tables of [`crate::jpeg::encoder`]: its code has four bits.
     pub fn dc(&mut self, symbol: u32) {
         self.put(symbol, 4);
     }
 
-    /// A symbol of the AC tables of [`crate::encoder`]: its code has eight bits.
+    /// A symbol of the AC tables of [`crate::jpeg::encoder`]: its code has eight bits.
     pub fn ac(&mut self, symbol: u32) {
         self.put(symbol, 8);
     }

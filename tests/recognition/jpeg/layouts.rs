@@ -1,7 +1,7 @@
 //! Every layout shows its picture, whichever library decodes it.
 
-use crate::encoder::{Layout, Scan, progressive, separate};
-use crate::picture::{Colours, assert_agrees, assert_refused, assert_shows, full};
+use crate::jpeg::encoder::{Layout, Scan, progressive, separate};
+use crate::jpeg::picture::{Colours, assert_agrees, assert_refused, assert_shows, full};
 use placeformer_core::types::ImageSize;
 use placeformer_vision::image::{DEVIATION, ImageConfig, MEAN, RgbImage, encode_jpeg, load_tensor};
 

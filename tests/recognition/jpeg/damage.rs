@@ -1,7 +1,7 @@
 //! What lacks image data, or is coded in a way that is not supported, is refused with its cause.
 
-use crate::encoder::{Layout, Scan, huffman_tables, segment};
-use crate::picture::{Colours, assert_refused, full, is_taken};
+use crate::jpeg::encoder::{Layout, Scan, huffman_tables, segment};
+use crate::jpeg::picture::{Colours, assert_refused, full, is_taken};
 
 fn layouts() -> Vec<Layout> {
     let layout = Layout::new(70, 50, Colours::YCbCr).sampled(&[(2, 1), (1, 1), (1, 1)]);

@@ -1,6 +1,6 @@
 //! The picture that the tests encode, and how near to it a decoded one comes.
 
-use crate::encoder::Layout;
+use crate::jpeg::encoder::Layout;
 use placeformer_core::types::ImageSize;
 use placeformer_vision::image::{ImageConfig, ImageError, RgbImage, decode, load_tensor};
 use std::f32::consts::TAU;

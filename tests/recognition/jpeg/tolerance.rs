@@ -1,7 +1,7 @@
 //! What viewers show in full is accepted, at every size, as the same picture.
 
-use crate::encoder::{Layout, jfif, segment};
-use crate::picture::{Colours, assert_agrees, assert_shows, full};
+use crate::jpeg::encoder::{Layout, jfif, segment};
+use crate::jpeg::picture::{Colours, assert_agrees, assert_shows, full};
 use placeformer_core::types::ImageSize;
 use placeformer_vision::image::{RgbImage, encode_jpeg};
 
@@ -206,7 +206,7 @@ fn quantisers_of_sixteen_bits_and_of_zero() {
 #[test]
 fn tables_between_scans_apply_to_the_scans_behind_them() {
     let layout = Layout::new(70, 50, Colours::YCbCr).separate();
-    let [dc, ac] = crate::encoder::huffman_tables();
+    let [dc, ac] = crate::jpeg::encoder::huffman_tables();
     // Tables that fit nothing stand first, and the right ones before each scan.
     let mut wrong = dc.clone();
     wrong[5] = 12;

@@ -1,8 +1,8 @@
 //! The work that a JPEG may cause is bounded before it is begun.
 
-use crate::bits::Bits;
-use crate::encoder::{Layout, Scan, end_run, segment};
-use crate::picture::Colours;
+use crate::jpeg::bits::Bits;
+use crate::jpeg::encoder::{Layout, Scan, end_run, segment};
+use crate::jpeg::picture::Colours;
 use placeformer_core::types::ImageSize;
 use placeformer_vision::image::{ImageConfig, ImageError, decode, load_tensor};
 
@@ -15,7 +15,7 @@ fn bomb(side: u16, scans: &[Scan]) -> Vec<u8> {
     frame.extend([side.to_be_bytes(), side.to_be_bytes()].concat());
     frame.extend([3, 1, 0x11, 0, 2, 0x11, 0, 3, 0x11, 0]);
     file.extend(segment(0xc2, &frame));
-    let [mut dc, ac] = crate::encoder::huffman_tables();
+    let [mut dc, ac] = crate::jpeg::encoder::huffman_tables();
     // One symbol, of one bit.
     dc.truncate(21);
     dc[5..21].fill(0);
@@ -144,7 +144,7 @@ fn more_than_a_hundred_scans_are_refused_however_small() {
 #[test]
 fn tables_and_metadata_that_nothing_uses_cost_nothing() {
     let layout = Layout::new(64, 64, Colours::YCbCr);
-    let [dc, ac] = crate::encoder::huffman_tables();
+    let [dc, ac] = crate::jpeg::encoder::huffman_tables();
     let profile = segment(
         0xe2,
         &[b"ICC_PROFILE\0\x01\x01".as_slice(), &[7; 60_000]].concat(),
