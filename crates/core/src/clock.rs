@@ -3,6 +3,7 @@
 //! A camera shows the time on the wall, and only some cameras also note how far that is from UTC.
 //! So what is read is a [`Clock`]: the time shown, and the offset if there is one.
 
+use crate::types::Timestamp;
 use time::{Date, Month, OffsetDateTime, PrimitiveDateTime, Time, UtcOffset};
 
 /// No place on Earth is further from UTC: the extremes in use are -12 and +14 hours.
@@ -41,17 +42,16 @@ impl Clock {
     }
 
     /// The moment, where the offset is known and the year is in range.
-    pub fn instant(self) -> Option<OffsetDateTime> {
+    pub fn instant(self) -> Option<Timestamp> {
         in_range(self.local.assume_offset(self.offset?))
     }
 }
 
-/// The time if its year is one of 1 to 9999, both as it stands and in UTC. Text (RFC 3339) can hold
-/// no other.
-pub fn in_range(time: OffsetDateTime) -> Option<OffsetDateTime> {
-    let utc = time.checked_to_offset(UtcOffset::UTC)?;
+/// The instant of a time whose year is one of 1 to 9999, both as it stands and in UTC. The year 0,
+/// which a [`Timestamp`] may have, is what unset clocks show.
+pub fn in_range(time: OffsetDateTime) -> Option<Timestamp> {
     let is_sound = |time: OffsetDateTime| (1..=9999).contains(&time.year());
-    (is_sound(time) && is_sound(utc)).then_some(time)
+    Timestamp::of(time).filter(|utc| is_sound(time) && is_sound(utc.instant()))
 }
 
 /// Reads `YYYY:MM:DD`, with colons, dashes, slashes or dots, and nothing after it.

@@ -6,7 +6,7 @@
 use super::positions::{Positions, Row};
 use super::timezone::ClockZone;
 use placeformer_core::geography::{UtmName, UtmZone};
-use placeformer_core::types::{ExternalId, ReferenceFields, Timestamp};
+use placeformer_core::types::{ExternalId, ReferenceFields};
 use placeformer_vision::image::read_exif;
 
 /// What is known of the photos, and how to read what they say.
@@ -111,7 +111,6 @@ impl Metadata {
         let exif = read_exif(image);
         let zone = self.timezone.as_ref();
         let in_zone = zone.and_then(|zone| zone.instant(exif.local_time?));
-        let in_zone = in_zone.and_then(Timestamp::of);
         Source {
             row: Row {
                 location: exif.location,

@@ -2,9 +2,10 @@
 
 use jiff::civil;
 use jiff::tz::TimeZone;
-use placeformer_core::clock::{Clock, in_range, parse_utc_offset};
+use placeformer_core::clock::{Clock, parse_utc_offset};
+use placeformer_core::types::Timestamp;
 use std::str::FromStr;
-use time::{OffsetDateTime, PrimitiveDateTime, UtcOffset};
+use time::{PrimitiveDateTime, UtcOffset};
 
 /// A zone from the command line: `Europe/Paris` or `+02:00`.
 #[derive(Debug, Clone)]
@@ -36,7 +37,7 @@ impl ClockZone {
     /// The moment at which a clock in this zone showed `local`. Of the two moments when clocks are
     /// set back, it is the first; a time that is left out when they are set forward counts with the
     /// offset from before.
-    pub(super) fn instant(&self, local: PrimitiveDateTime) -> Option<OffsetDateTime> {
+    pub(super) fn instant(&self, local: PrimitiveDateTime) -> Option<Timestamp> {
         let offset = match self {
             Self::Fixed(offset) => *offset,
             Self::Region(zone) => region_offset(zone, local)?,
@@ -45,7 +46,7 @@ impl ClockZone {
             local,
             offset: Some(offset),
         };
-        clock.instant().and_then(in_range)
+        clock.instant()
     }
 }
 
@@ -71,11 +72,12 @@ fn region_offset(zone: &TimeZone, local: PrimitiveDateTime) -> Option<UtcOffset>
 #[cfg(test)]
 mod tests {
     use super::*;
+    use time::OffsetDateTime;
     use time::macros::datetime;
 
     fn instant(zone: &str, local: PrimitiveDateTime) -> OffsetDateTime {
         let zone: ClockZone = zone.parse().unwrap();
-        zone.instant(local).unwrap()
+        zone.instant(local).unwrap().instant()
     }
 
     #[test]

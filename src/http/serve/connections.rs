@@ -7,10 +7,10 @@
 //! client gets one of a few connections that are kept for probes.
 
 use super::activity::Activity;
-use super::address::ClientAddress;
 use crate::http::config::HttpConfig;
 use crate::ops::Metrics;
 use crate::ops::metrics::{ConnectionCut, ConnectionKind};
+use crate::pipeline::network_of;
 use std::collections::HashMap;
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -36,14 +36,14 @@ struct Limits {
 struct Open {
     by_id: HashMap<u64, Entry>,
     /// How many general connections each address has; those without any are missing.
-    by_address: HashMap<ClientAddress, usize>,
+    by_address: HashMap<IpAddr, usize>,
     general: usize,
     reserved: usize,
     next_id: u64,
 }
 
 struct Entry {
-    address: ClientAddress,
+    address: IpAddr,
     kind: ConnectionKind,
     activity: Arc<Activity>,
     evicted: CancellationToken,
@@ -84,7 +84,7 @@ impl Connections {
 
     /// A place for a connection from `peer`; `None` if it cannot even have a reserved one.
     pub(super) fn admit(self: &Arc<Self>, peer: IpAddr) -> Option<Place> {
-        let address = ClientAddress::from(peer);
+        let address = network_of(peer);
         let mut open = self.open();
         self.end_silent(&mut open);
         let Some(kind) = self.kind_for(&mut open, peer, address) else {
@@ -117,12 +117,7 @@ impl Connections {
     }
 
     /// The kind of place there is for a new connection, which may be another's until now.
-    fn kind_for(
-        &self,
-        open: &mut Open,
-        peer: IpAddr,
-        address: ClientAddress,
-    ) -> Option<ConnectionKind> {
+    fn kind_for(&self, open: &mut Open, peer: IpAddr, address: IpAddr) -> Option<ConnectionKind> {
         let is_trusted = self.limits.trusted.contains(&peer.to_canonical());
         let own = open.by_address.get(&address).copied().unwrap_or(0);
         let has_place = if !is_trusted && own >= self.limits.per_address {
@@ -187,7 +182,7 @@ impl Connections {
 
 impl Entry {
     /// How long this connection has been idle, if it is a general one (of that address).
-    fn general_of(&self, address: Option<ClientAddress>) -> Option<Duration> {
+    fn general_of(&self, address: Option<IpAddr>) -> Option<Duration> {
         let is_meant = address.is_none_or(|address| address == self.address);
         if self.kind != ConnectionKind::General || !is_meant {
             return None;
@@ -234,7 +229,7 @@ impl Open {
         Some(entry)
     }
 
-    fn forget_one_of(&mut self, address: ClientAddress) {
+    fn forget_one_of(&mut self, address: IpAddr) {
         if let Some(count) = self.by_address.get_mut(&address) {
             *count -= 1;
             if *count == 0 {

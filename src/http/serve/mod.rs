@@ -3,7 +3,6 @@
 //! how everything ends.
 
 mod activity;
-mod address;
 mod connection;
 mod connections;
 pub mod tls;

@@ -128,7 +128,7 @@ fn parse_time(text: &str) -> Option<Timestamp> {
         digits(time_part, 2..4, 0)?,
         digits(time_part, 4..6, 0)?,
     );
-    in_range(PrimitiveDateTime::new(date, time.ok()?).assume_utc()).and_then(Timestamp::of)
+    in_range(PrimitiveDateTime::new(date, time.ok()?).assume_utc())
 }
 
 #[cfg(test)]

@@ -277,6 +277,5 @@ fn parse_time(text: &str, zone: Option<&ClockZone>) -> anyhow::Result<Timestamp>
             "captured_at \"{shown}\" has no offset from UTC, as RFC 3339 asks for; give --timezone"
         ),
     };
-    let instant = instant.and_then(Timestamp::of);
     instant.ok_or_else(|| anyhow!("captured_at \"{shown}\" is outside the years 1 to 9999"))
 }

@@ -38,6 +38,13 @@ pub struct NetVladParameters {
     pub assignment: Vec<f32>,
 }
 
+impl NetVladParameters {
+    /// All parts, in the order of the fields.
+    fn parts(&self) -> [&[f32]; 4] {
+        [&self.mean, &self.projection, &self.words, &self.assignment]
+    }
+}
+
 /// A NetVLAD, ready to pool tokens.
 #[derive(Debug, Clone)]
 pub struct NetVlad {
@@ -116,16 +123,10 @@ impl NetVlad {
 
     /// Adds the learned parts to the hash of a head.
     pub(super) fn hash_into(&self, hasher: &mut Sha256) {
-        let NetVladParameters {
-            mean,
-            projection,
-            words,
-            assignment,
-        } = &self.parameters;
         hasher.update(b"netvlad");
         // The width tells apart parts of other shapes with the same values.
         hasher.update((self.width as u64).to_le_bytes());
-        for part in [mean, projection, words, assignment] {
+        for part in self.parameters.parts() {
             hasher.update(bytemuck::cast_slice::<f32, u8>(part));
         }
     }
@@ -209,10 +210,9 @@ fn check_values(parameters: &NetVladParameters, width: usize) -> Result<(), Stri
         mean,
         projection,
         words,
-        assignment,
+        ..
     } = parameters;
-    let parts = [mean, projection, words, assignment];
-    let mut values = parts.into_iter().flatten();
+    let mut values = parameters.parts().into_iter().flatten();
     // NaN is outside of every range.
     let is_sound = |value: &f32| (-LARGEST..=LARGEST).contains(value);
     if let Some(value) = values.find(|value| !is_sound(value)) {

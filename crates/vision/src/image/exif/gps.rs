@@ -7,8 +7,8 @@
 
 use super::tiff::{Directory, Field};
 use placeformer_core::clock::{in_range, parse_date};
-use placeformer_core::types::{GeoPoint, Heading};
-use time::{Duration, OffsetDateTime, PrimitiveDateTime, Time};
+use placeformer_core::types::{GeoPoint, Heading, Timestamp};
+use time::{Duration, PrimitiveDateTime, Time};
 
 const LATITUDE_REF: u16 = 1;
 const LATITUDE: u16 = 2;
@@ -45,7 +45,7 @@ pub(super) struct Gps {
     pub(super) location: Option<GeoPoint>,
     pub(super) heading: Option<Heading>,
     /// In UTC.
-    pub(super) time: Option<OffsetDateTime>,
+    pub(super) time: Option<Timestamp>,
 }
 
 impl Gps {
@@ -163,7 +163,7 @@ fn degrees(field: Field<'_>) -> Option<f64> {
     Some(if is_negative { -magnitude } else { magnitude })
 }
 
-fn gps_time(gps: &Directory<'_>) -> Option<OffsetDateTime> {
+fn gps_time(gps: &Directory<'_>) -> Option<Timestamp> {
     let date = parse_date(&gps.field(DATE_STAMP)?.text()?)?;
     let clock = gps.field(TIME_STAMP)?;
     let part = |index: usize, end: f64| {

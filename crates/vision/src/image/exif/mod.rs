@@ -86,7 +86,7 @@ pub fn read_exif(bytes: &[u8]) -> ExifInfo {
     ExifInfo {
         location,
         heading,
-        captured_at: captured_at.and_then(|moment| Timestamp::of(moment.at)),
+        captured_at: captured_at.map(|moment| moment.at),
         local_time: captured_at.and_then(|moment| moment.local),
         sources: ExifSources {
             location: location_source,

@@ -5,6 +5,7 @@
 //! has ten bits, so an old receiver is wrong by multiples of 1024 weeks.
 
 use placeformer_core::clock::{Clock, in_range};
+use placeformer_core::types::Timestamp;
 use time::macros::date;
 use time::{Date, Duration, OffsetDateTime, PrimitiveDateTime};
 
@@ -20,16 +21,16 @@ const OFFSET_TOLERANCE: Duration = Duration::hours(26);
 /// When a photo was taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Moment {
-    pub(super) at: OffsetDateTime,
+    pub(super) at: Timestamp,
     /// What the camera's clock showed, if `at` is that, taken as UTC.
     pub(super) local: Option<PrimitiveDateTime>,
 }
 
 impl Moment {
     /// Chooses between the camera's clock and the receiver's.
-    pub(super) fn of(clock: Option<Clock>, gps: Option<OffsetDateTime>) -> Option<Self> {
+    pub(super) fn of(clock: Option<Clock>, gps: Option<Timestamp>) -> Option<Self> {
         let sound_clock = clock.filter(|clock| clock.local.year() >= FIRST_YEAR);
-        let gps = gps.filter(|gps| is_believable(*gps, sound_clock));
+        let gps = gps.filter(|gps| is_believable(gps.instant(), sound_clock));
         let exact = |at| Self { at, local: None };
         let of_sound_clock = sound_clock.and_then(Clock::instant).map(exact);
         let of_gps = gps.map(exact);
