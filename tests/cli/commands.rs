@@ -2,19 +2,16 @@
 
 use crate::common::program::offline;
 use crate::common::{places, service as support};
-use placeformer::http::serve;
 use placeformer_core::types::ReferenceId;
 use placeformer_store::{Inserted, SqliteStore, StoreConfig, WritePlaces};
 use places::{map, named_reference};
 use serde_json::Value;
-use std::future::pending;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 use support::{App, picture};
 use tempfile::TempDir;
-use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 
 /// Runs the binary in `folder`, where it finds no model, no network and no settings but its own.
@@ -223,9 +220,7 @@ mod load {
         fn new() -> Self {
             let runtime = Runtime::new().unwrap();
             let app = App::new();
-            let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0")).unwrap();
-            let url = format!("http://{}", listener.local_addr().unwrap());
-            runtime.spawn(serve(listener, app.state.clone(), pending()));
+            let url = app.listen(&runtime);
             let added = runtime.block_on(app.post_png("/references?map=m", 0));
             added.created();
             Self {

@@ -5,17 +5,14 @@ use crate::common::noise;
 use crate::common::photo::{Says, png_with_exif, with_chunk};
 use crate::common::program::{has_model, offline, placeformer, words};
 use crate::common::service::App;
-use placeformer::http::serve;
 use serde_json::{Value, json};
 use std::ffi::OsStr;
-use std::future::pending;
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
 use std::os::unix::net::UnixListener;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
-use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 
 /// A server, and a folder with an empty folder `photos`.
@@ -68,9 +65,7 @@ impl Served {
     fn new() -> Self {
         let runtime = Runtime::new().unwrap();
         let app = App::new();
-        let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0")).unwrap();
-        let url = format!("http://{}", listener.local_addr().unwrap());
-        runtime.spawn(serve(listener, app.state.clone(), pending()));
+        let url = app.listen(&runtime);
         let folder = tempfile::tempdir().unwrap();
         std::fs::create_dir(folder.path().join("photos")).unwrap();
         Self {

@@ -7,7 +7,7 @@ use axum::http::{HeaderMap, Request, StatusCode};
 use axum::response::Response;
 use http_body_util::BodyExt;
 use placeformer::config::Config;
-use placeformer::http::{AppState, app};
+use placeformer::http::{AppState, app, serve};
 use placeformer::ops::{Health, Metrics};
 use placeformer::pipeline::{DescriptorSource, Parts, Service};
 use placeformer_core::types::{
@@ -21,11 +21,14 @@ use placeformer_vision::image::{ImageConfig, ImageError, load_tensor};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
+use std::future::pending;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 use tempfile::TempDir;
+use tokio::net::TcpListener;
+use tokio::runtime::Runtime;
 use tower::ServiceExt;
 
 /// Size the fake model asks for.
@@ -308,6 +311,14 @@ impl App {
         change: impl FnOnce(&mut Config),
     ) -> Self {
         Self::around(|store| Arc::new(store), directory, source, change)
+    }
+
+    /// Serves behind a socket for as long as `runtime` lives; returns the URL.
+    pub fn listen(&self, runtime: &Runtime) -> String {
+        let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0")).unwrap();
+        let url = format!("http://{}", listener.local_addr().unwrap());
+        runtime.spawn(serve(listener, self.state.clone(), pending()));
+        url
     }
 
     /// With a store of the test's own around the real one.
