@@ -3,8 +3,14 @@
 //!
 //! Each caller has a line of its own, in which the first to wait is the first to be served. A
 //! permit that becomes free goes to the caller whose turn it is, and that caller then goes to the
-//! end of the round. So a request waits for at most one other of each caller per request of its own
-//! caller that is ahead of it, however long the lines of the others are.
+//! end of the round. A newcomer, who has not been served since the round last passed it, goes
+//! before the round: so a vehicle that asks now and then waits for hardly anybody, although others
+//! always have requests waiting. This is the order of flow queues in routers (RFC 8290, 4.1),
+//! except that the round is never kept waiting for more than a few newcomers in a row, because
+//! anybody can have many addresses.
+//!
+//! So a request waits for at most two others of each caller per request of its own caller that is
+//! ahead of it, however long the lines of the others are.
 //!
 //! Whoever has time may wait behind the lines: it is served when nobody is left in them who came
 //! before it. So one who comes to a line waits for those only who waited behind the lines already.
@@ -177,44 +183,72 @@ impl Drop for Place {
     }
 }
 
+/// How many newcomers are served in a row while the round waits. Those beyond go to its end.
+const NEWCOMERS_IN_A_ROW: usize = 4;
+
 /// Lines of values, one for each key, that are served in turn.
 struct Turns<K, V> {
     /// No line is empty.
     lines: HashMap<K, VecDeque<V>>,
-    /// Every key that has a line, the one whose turn it is first.
+    /// Keys that have a line and are not in the round, the first to come first.
+    newcomers: VecDeque<K>,
+    /// Keys that have been served, the one whose turn it is first. One without a line stays until
+    /// the round passes it, so that it is no newcomer before everybody else had a turn.
     round: VecDeque<K>,
+    /// How many newcomers were served since the round was.
+    newcomers_in_a_row: usize,
 }
 
 impl<K, V> Default for Turns<K, V> {
     fn default() -> Self {
         Self {
             lines: HashMap::new(),
+            newcomers: VecDeque::new(),
             round: VecDeque::new(),
+            newcomers_in_a_row: 0,
         }
     }
 }
 
 impl<K: Clone + Eq + Hash, V> Turns<K, V> {
-    /// Adds a value to the end of the line of `key`. A new line goes to the end of the round.
+    /// Adds a value to the end of the line of `key`.
     fn push(&mut self, key: K, value: V) {
-        let line = self.lines.entry(key.clone()).or_insert_with(|| {
-            self.round.push_back(key);
-            VecDeque::new()
-        });
-        line.push_back(value);
+        if !self.lines.contains_key(&key) && !self.round.contains(&key) {
+            self.newcomers.push_back(key.clone());
+        }
+        self.lines.entry(key).or_default().push_back(value);
     }
 
-    /// Takes the first value of the line whose turn it is; the line goes to the end of the round.
+    /// Takes the first value of the line whose turn it is; its key goes to the end of the round.
     fn pop(&mut self) -> Option<V> {
-        let key = self.round.pop_front()?;
+        while self
+            .round
+            .pop_front_if(|key| !self.lines.contains_key(key))
+            .is_some()
+        {}
+        let key = self.next_key()?;
         let line = self.lines.get_mut(&key)?;
         let value = line.pop_front();
         if line.is_empty() {
             self.lines.remove(&key);
-        } else {
-            self.round.push_back(key);
         }
+        self.round.push_back(key);
         value
+    }
+
+    /// Takes out the key whose turn it is.
+    fn next_key(&mut self) -> Option<K> {
+        if self.newcomers_in_a_row == NEWCOMERS_IN_A_ROW && !self.round.is_empty() {
+            // They wait for one round like everybody else, and so nobody is served a second time
+            // before them.
+            self.round.append(&mut self.newcomers);
+        }
+        if let Some(newcomer) = self.newcomers.pop_front() {
+            self.newcomers_in_a_row = (self.newcomers_in_a_row + 1).min(NEWCOMERS_IN_A_ROW);
+            return Some(newcomer);
+        }
+        self.newcomers_in_a_row = 0;
+        self.round.pop_front()
     }
 
     /// Takes the first value of a line for which `is_it` holds out of it; false if there is none.
@@ -228,7 +262,7 @@ impl<K: Clone + Eq + Hash, V> Turns<K, V> {
         line.remove(position);
         if line.is_empty() {
             self.lines.remove(key);
-            self.round.retain(|other| other != key);
+            self.newcomers.retain(|other| other != key);
         }
         true
     }
@@ -329,9 +363,10 @@ mod tests {
                             "one of {name} was served before another of it that came first"
                         );
                         for (other, served) in &mut seen {
+                            let times = served.iter().filter(|served| **served == name).count();
                             prop_assert!(
-                                *other == name || !served.contains(&name),
-                                "{name} was served twice while {other} waited for its turn"
+                                *other == name || times < 2,
+                                "{name} was served three times while {other} waited for its turn"
                             );
                             served.push(name);
                         }
@@ -345,6 +380,67 @@ mod tests {
             }
             prop_assert!(waiting.is_empty(), "{} were never served", waiting.len());
         }
+    }
+
+    /// Serves everybody; returns the names in the order in which they were served.
+    fn order_of(held: FairPermit, waiting: Vec<(usize, BoxFuture<'_, FairPermit>)>) -> Vec<usize> {
+        let mut waiting = waiting;
+        let mut order = Vec::new();
+        let mut held = Some(held);
+        while !waiting.is_empty() {
+            drop(held.take());
+            let (position, permit) = (0..waiting.len())
+                .find_map(|i| granted(&mut waiting[i].1).map(|permit| (i, permit)))
+                .expect("a free permit was granted to nobody");
+            held = Some(permit);
+            order.push(waiting.remove(position).0);
+        }
+        order
+    }
+
+    #[test]
+    fn who_asks_seldom_is_served_before_those_who_always_wait() {
+        let semaphore = FairSemaphore::new(1);
+        let names: Vec<Caller> = (0..4).map(caller).collect();
+        let ask = |name: usize| (name, queued(semaphore.acquire(&names[name])));
+        let mut held = semaphore.acquire(&names[0]).now_or_never().unwrap();
+        let mut waiting = vec![ask(0), ask(0), ask(1), ask(1), ask(2), ask(2)];
+        // Everybody had a turn, so that three lines are in the round.
+        for position in [0, 2, 4] {
+            drop(held);
+            held = granted(&mut waiting[position].1).expect("the turn of another");
+        }
+        let mut waiting: Vec<_> = waiting.into_iter().skip(1).step_by(2).collect();
+        waiting.push(ask(3));
+        waiting.push(ask(3));
+        let order = order_of(held, waiting);
+        assert_eq!(
+            order,
+            [3, 0, 1, 2, 3],
+            "the second of the newcomer waits for the round"
+        );
+    }
+
+    #[test]
+    fn newcomers_without_end_do_not_keep_the_round_waiting() {
+        let semaphore = FairSemaphore::new(1);
+        let names: Vec<Caller> = (0..20).map(caller).collect();
+        let ask = |name: usize| (name, queued(semaphore.acquire(&names[name])));
+        let held = semaphore.acquire(&names[0]).now_or_never().unwrap();
+        let mut first = queued(semaphore.acquire(&names[0]));
+        let mut waiting = vec![ask(0), ask(0)];
+        drop(held);
+        let held = granted(&mut first).expect("nobody else waits");
+        waiting.extend((1..20).map(ask));
+        let order = order_of(held, waiting);
+        // The first of all was a newcomer, too.
+        assert_eq!(order[..4], [1, 2, 3, 0]);
+        let second = order.iter().rposition(|name| *name == 0);
+        assert_eq!(
+            second,
+            Some(20),
+            "each newcomer is served before the same one again"
+        );
     }
 
     #[test]
