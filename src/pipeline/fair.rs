@@ -3,11 +3,10 @@
 //!
 //! Each caller has a line of its own, in which the first to wait is the first to be served. A
 //! permit that becomes free goes to the caller whose turn it is, and that caller then goes to the
-//! end of the round. A newcomer, who has not been served since the round last passed it, goes
-//! before the round: so a vehicle that asks now and then waits for hardly anybody, although others
-//! always have requests waiting. This is the order of flow queues in routers (RFC 8290, 4.1),
-//! except that the round is never kept waiting for more than a few newcomers in a row, because
-//! anybody can have many addresses.
+//! end of the round. A newcomer, who had none of the last turns, goes before the round: so a
+//! vehicle that asks now and then waits for hardly anybody, although others always have requests
+//! waiting. Routers order flows of packets like that (RFC 8290, 4.1). But the round is never kept
+//! waiting for more than a few newcomers in a row, because anybody can have many addresses.
 //!
 //! So a request waits for at most two others of each caller per request of its own caller that is
 //! ahead of it, however long the lines of the others are.
@@ -74,6 +73,9 @@ impl FairSemaphore {
             let mut state = self.lock();
             if state.free > 0 {
                 state.free -= 1;
+                if let Some(caller) = line {
+                    state.lines.remember(caller.clone());
+                }
                 return FairPermit(self.clone());
             }
             state.enqueue(self, line)
@@ -186,17 +188,21 @@ impl Drop for Place {
 /// How many newcomers are served in a row while the round waits. Those beyond go to its end.
 const NEWCOMERS_IN_A_ROW: usize = 4;
 
+/// Who had one of so many turns is no newcomer; of more turns while many callers wait.
+const RECENT_TURNS: usize = 16;
+
 /// Lines of values, one for each key, that are served in turn.
 struct Turns<K, V> {
     /// No line is empty.
     lines: HashMap<K, VecDeque<V>>,
-    /// Keys that have a line and are not in the round, the first to come first.
+    /// Keys that have a line and had no turn lately, the first to come first.
     newcomers: VecDeque<K>,
-    /// Keys that have been served, the one whose turn it is first. One without a line stays until
-    /// the round passes it, so that it is no newcomer before everybody else had a turn.
+    /// The other keys that have a line, the one whose turn it is first.
     round: VecDeque<K>,
     /// How many newcomers were served since the round was.
     newcomers_in_a_row: usize,
+    /// Who had the last turns, the latest last.
+    recent: VecDeque<K>,
 }
 
 impl<K, V> Default for Turns<K, V> {
@@ -206,6 +212,7 @@ impl<K, V> Default for Turns<K, V> {
             newcomers: VecDeque::new(),
             round: VecDeque::new(),
             newcomers_in_a_row: 0,
+            recent: VecDeque::new(),
         }
     }
 }
@@ -213,27 +220,39 @@ impl<K, V> Default for Turns<K, V> {
 impl<K: Clone + Eq + Hash, V> Turns<K, V> {
     /// Adds a value to the end of the line of `key`.
     fn push(&mut self, key: K, value: V) {
-        if !self.lines.contains_key(&key) && !self.round.contains(&key) {
-            self.newcomers.push_back(key.clone());
+        if !self.lines.contains_key(&key) {
+            let waiting = match self.recent.contains(&key) {
+                true => &mut self.round,
+                false => &mut self.newcomers,
+            };
+            waiting.push_back(key.clone());
         }
         self.lines.entry(key).or_default().push_back(value);
     }
 
-    /// Takes the first value of the line whose turn it is; its key goes to the end of the round.
+    /// Takes the first value of the line whose turn it is; the line goes to the end of the round.
     fn pop(&mut self) -> Option<V> {
-        while self
-            .round
-            .pop_front_if(|key| !self.lines.contains_key(key))
-            .is_some()
-        {}
         let key = self.next_key()?;
         let line = self.lines.get_mut(&key)?;
         let value = line.pop_front();
         if line.is_empty() {
             self.lines.remove(&key);
+        } else {
+            self.round.push_back(key.clone());
         }
-        self.round.push_back(key);
+        self.remember(key);
         value
+    }
+
+    /// Remembers that `key` had a turn.
+    fn remember(&mut self, key: K) {
+        self.recent.push_back(key);
+        // The last of the round waits for so many turns at most. Whoever had one of them is not to
+        // go before it again.
+        let longest_round = (NEWCOMERS_IN_A_ROW + 1) * self.lines.len();
+        while self.recent.len() > RECENT_TURNS.max(longest_round) {
+            self.recent.pop_front();
+        }
     }
 
     /// Takes out the key whose turn it is.
@@ -263,6 +282,7 @@ impl<K: Clone + Eq + Hash, V> Turns<K, V> {
         if line.is_empty() {
             self.lines.remove(key);
             self.newcomers.retain(|other| other != key);
+            self.round.retain(|other| other != key);
         }
         true
     }
@@ -403,9 +423,9 @@ mod tests {
         let semaphore = FairSemaphore::new(1);
         let names: Vec<Caller> = (0..4).map(caller).collect();
         let ask = |name: usize| (name, queued(semaphore.acquire(&names[name])));
-        let mut held = semaphore.acquire(&names[0]).now_or_never().unwrap();
+        let mut held = semaphore.acquire(&caller(9)).now_or_never().unwrap();
         let mut waiting = vec![ask(0), ask(0), ask(1), ask(1), ask(2), ask(2)];
-        // Everybody had a turn, so that three lines are in the round.
+        // Everybody has a turn, so that nobody is a newcomer any more.
         for position in [0, 2, 4] {
             drop(held);
             held = granted(&mut waiting[position].1).expect("the turn of another");
@@ -433,8 +453,7 @@ mod tests {
         let held = granted(&mut first).expect("nobody else waits");
         waiting.extend((1..20).map(ask));
         let order = order_of(held, waiting);
-        // The first of all was a newcomer, too.
-        assert_eq!(order[..4], [1, 2, 3, 0]);
+        assert_eq!(order[..5], [1, 2, 3, 4, 0]);
         let second = order.iter().rposition(|name| *name == 0);
         assert_eq!(
             second,
