@@ -136,11 +136,12 @@ class Honest:
             thread.join()
         return self.answered, self.errors
 
-    def slowest_stages(self):
-        """The 99th percentile of each stage that the answers tell, in words."""
+    def stages_in_words(self):
+        """The median and the 99th percentile of each stage that the answers tell, in words."""
         names = sorted({name for stages in self.stages for name in stages})
         values = {name: [stages.get(name, 0.0) for stages in self.stages] for name in names}
-        return ", ".join(f"{name} {percentile(values[name], 99):.0f} ms" for name in names)
+        shown = [(name, percentile(values[name], 50), percentile(values[name], 99)) for name in names]
+        return ", ".join(f"{name} {median:.0f}/{slow:.0f}" for name, median, slow in shown)
 
 
 class Watch:
@@ -200,7 +201,7 @@ def soak(server, arguments, keys):
     honest = Honest(target, keys["honest"])
     honest.run(5)
     quiet, errors = honest.run(arguments.quiet_seconds)
-    print(f"alone:        {quantiles(quiet)} ({honest.slowest_stages()})", flush=True)
+    print(f"alone:        {quantiles(quiet)} ({honest.stages_in_words()})", flush=True)
     problems = [f"an error while it was alone: {error}" for error in errors[:3]]
 
     load = fleet(server, arguments, keys["fleet"])
@@ -214,7 +215,7 @@ def soak(server, arguments, keys):
     loud, errors = honest.run(arguments.seconds - 2, watch)
     stopped.set()
     load.wait()
-    print(f"beside them:  {quantiles(loud)} ({honest.slowest_stages()})")
+    print(f"beside them:  {quantiles(loud)} ({honest.stages_in_words()})")
     print(f"ratio of p99: {percentile(loud, 99) / percentile(quiet, 99):.2f} (at most {arguments.max_ratio})")
     report(server, outcomes.get(), watch)
     problems += [f"{len(errors)} errors of the honest client, such as {error}" for error in errors[:1]]

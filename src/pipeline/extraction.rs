@@ -5,6 +5,9 @@
 //! at any moment. So every permit, lock and ticket that bounds such work moves into it and is given
 //! back when the work itself ends: clients that hang up and come again get no more threads than
 //! clients that stay.
+//!
+//! Between the blocks of the transformer the worker is lent to a caller that asks seldom
+//! ([`super::fair`]). So such a caller does not even wait for the extraction that is under way.
 
 use super::admission::Ticket;
 use super::blocking::{Panicked, blocking};
@@ -15,9 +18,10 @@ use crate::ops::{Metrics, PipelineStage};
 use bytes::Bytes;
 use placeformer_core::types::{Deadline, Descriptor, ImageTensor};
 use placeformer_vision::image::ImageConfig;
+use std::cell::Cell;
 use std::future::Future;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use tokio::time::timeout;
 
 /// What errors call the computation of a descriptor.
@@ -48,8 +52,17 @@ pub(super) struct Extraction {
 
 /// The right to use the compute worker; given back when dropped.
 struct WorkerPermit {
-    _worker: FairPermit,
+    worker: FairPermit,
     _ingest: Option<FairPermit>,
+}
+
+/// What the compute worker made of an image.
+struct Extracted {
+    descriptor: Result<Descriptor, PipelineError>,
+    /// Time in which it was computed.
+    computed: Duration,
+    /// Time for which the worker was lent to others.
+    lent: Duration,
 }
 
 impl Purpose {
@@ -117,14 +130,22 @@ impl Extraction {
         let waiting_since = Instant::now();
         let permit = self.worker_permit(purpose, ticket.caller());
         let permit = purpose.within_deadline(EXTRACTION, permit).await?;
-        timings.record(&self.metrics, PipelineStage::Queue, waiting_since.elapsed());
-        purpose.check_deadline(EXTRACTION)?;
-
-        let started = Instant::now();
-        let extracting = self.extract(tensor, permit, ticket.clone());
-        let extracted = purpose.within_deadline(EXTRACTION, extracting).await?;
-        timings.record(&self.metrics, PipelineStage::Extract, started.elapsed());
-        extracted
+        let waited = waiting_since.elapsed();
+        let in_time = purpose.check_deadline(EXTRACTION);
+        let extracted = match in_time {
+            Ok(()) => {
+                let extracting = self.extract(tensor, permit, ticket.clone());
+                purpose.within_deadline(EXTRACTION, extracting).await
+            }
+            Err(late) => Err(late),
+        };
+        let lent = extracted
+            .as_ref()
+            .map_or(Duration::ZERO, |extracted| extracted.lent);
+        timings.record(&self.metrics, PipelineStage::Queue, waited + lent);
+        let extracted = extracted?;
+        timings.record(&self.metrics, PipelineStage::Extract, extracted.computed);
+        extracted.descriptor
     }
 
     /// Bytes to the tensor that the model sees.
@@ -154,33 +175,50 @@ impl Extraction {
             Purpose::Ingest => {
                 let ingest = self.ingest.acquire(caller).await;
                 WorkerPermit {
-                    _worker: self.worker.acquire_behind().await,
+                    worker: self.worker.acquire_behind().await,
                     _ingest: Some(ingest),
                 }
             }
             Purpose::Answer(_) => WorkerPermit {
-                _worker: self.worker.acquire(caller).await,
+                worker: self.worker.acquire(caller).await,
                 _ingest: None,
             },
         }
     }
 
-    /// Tensor to descriptor, on the compute worker.
+    /// Tensor to descriptor, on the compute worker, which is lent in between.
     async fn extract(
         &self,
         tensor: ImageTensor,
         permit: WorkerPermit,
         ticket: Arc<Ticket>,
-    ) -> Result<Descriptor, PipelineError> {
-        let panicked = || PipelineError::Panicked { stage: EXTRACTION };
+    ) -> Extracted {
         let source = self.source.clone();
-        let extracted = blocking(move || {
-            let extracted = source.describe(&[tensor]);
+        let extracting = blocking(move || {
+            let started = Instant::now();
+            let lent = Cell::new(Duration::ZERO);
+            let pause = || lent.set(lent.get() + permit.worker.lend());
+            let described = source.describe_with_pauses(&[tensor], &pause);
             drop((permit, ticket));
-            extracted
+            (described, started.elapsed(), lent.get())
         });
-        let mut descriptors = extracted.await.map_err(|_| panicked())??;
-        descriptors.pop().ok_or_else(panicked)
+        let panicked = || PipelineError::Panicked { stage: EXTRACTION };
+        let Ok((described, took, lent)) = extracting.await else {
+            return Extracted {
+                descriptor: Err(panicked()),
+                computed: Duration::ZERO,
+                lent: Duration::ZERO,
+            };
+        };
+        let descriptor = match described {
+            Ok(mut descriptors) => descriptors.pop().ok_or_else(panicked),
+            Err(error) => Err(error.into()),
+        };
+        Extracted {
+            descriptor,
+            computed: took - lent,
+            lent,
+        }
     }
 
     /// Runs `work` on the bytes of an image, on no more threads at once than there are cores.

@@ -3,21 +3,27 @@
 //!
 //! Each caller has a line of its own, in which the first to wait is the first to be served. A
 //! permit that becomes free goes to the caller whose turn it is, and that caller then goes to the
-//! end of the round. A newcomer, who had none of the last turns, goes before the round: so a
-//! vehicle that asks now and then waits for hardly anybody, although others always have requests
-//! waiting. Routers order flows of packets like that (RFC 8290, 4.1). But the round is never kept
-//! waiting for more than a few newcomers in a row, because anybody can have many addresses.
+//! end of the round. A newcomer, who had no turn since the round last passed it, goes before the
+//! round; of several, the one that had no turn for the longest. So a vehicle that asks now and then
+//! waits for hardly anybody, although others always have requests waiting. Routers order flows of
+//! packets like that (RFC 8290, 4.1). But the round is never kept waiting for more than a few
+//! newcomers in a row, because anybody can have many addresses.
 //!
 //! So a request waits for at most two others of each caller per request of its own caller that is
 //! ahead of it, however long the lines of the others are.
+//!
+//! Long work may lend its permit in between, to a newcomer that asks for less than half of its
+//! share. So the wait of a vehicle is shorter than the work of another, too.
 //!
 //! Whoever has time may wait behind the lines: it is served when nobody is left in them who came
 //! before it. So one who comes to a line waits for those only who waited behind the lines already.
 
 use super::caller::Caller;
-use std::collections::{HashMap, VecDeque};
+use std::cell::Cell;
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::hash::Hash;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 
 /// A number of permits for which callers take turns. Clones share the permits.
@@ -37,11 +43,19 @@ struct State {
 /// One who waits.
 struct Waiting {
     arrival: u64,
-    granted: oneshot::Sender<()>,
+    granted: oneshot::Sender<FairPermit>,
 }
 
+/// How often a permit is lent at most, so that its work ends however many ask for it.
+const LENT_AT_MOST: u32 = 2;
+
 /// A permit; given back when dropped.
-pub(super) struct FairPermit(FairSemaphore);
+pub(super) struct FairPermit {
+    semaphore: FairSemaphore,
+    /// Who lent it, and waits to have it back.
+    lender: Option<mpsc::Sender<()>>,
+    lent: Cell<u32>,
+}
 
 impl FairSemaphore {
     pub(super) fn new(permits: usize) -> Self {
@@ -69,29 +83,41 @@ impl FairSemaphore {
     }
 
     async fn acquire_in(&self, line: Option<&Caller>) -> FairPermit {
-        let place = {
+        let mut place = {
             let mut state = self.lock();
             if state.free > 0 {
                 state.free -= 1;
                 if let Some(caller) = line {
                     state.lines.remember(caller.clone());
                 }
-                return FairPermit(self.clone());
+                return self.permit(None);
             }
             state.enqueue(self, line)
         };
-        place.granted().await
+        let granted = (&mut place.granted).await;
+        // The sender stays in the line until it sends or `place` is dropped.
+        granted.expect("whoever waits is granted a permit")
+    }
+
+    fn permit(&self, lender: Option<mpsc::Sender<()>>) -> FairPermit {
+        FairPermit {
+            semaphore: self.clone(),
+            lender,
+            lent: Cell::new(0),
+        }
     }
 
     /// Hands a permit that was given back to the next.
     fn release(&self) {
-        let mut state = self.lock();
-        match state.next() {
-            // Whoever stops waiting leaves the line first, so that somebody receives this.
-            Some(next) => {
-                let _ = next.granted.send(());
-            }
-            None => state.free += 1,
+        let next = {
+            let mut state = self.lock();
+            let next = state.next();
+            state.free += usize::from(next.is_none());
+            next
+        };
+        if let Some(next) = next {
+            // If it has just stopped waiting, the permit comes back here and goes to the next.
+            drop(next.granted.send(self.permit(None)));
         }
     }
 
@@ -102,9 +128,40 @@ impl FairSemaphore {
     }
 }
 
+impl FairPermit {
+    /// Lends the permit to a newcomer that asks for less than half of its share, if one waits, and
+    /// blocks until it is given back; returns how long that took.
+    ///
+    /// A permit is lent twice at most, and never lent on: so nobody's work is kept waiting without
+    /// end, and at most two have begun and not ended for each permit.
+    pub(super) fn lend(&self) -> Duration {
+        if self.lender.is_some() || self.lent.get() == LENT_AT_MOST {
+            return Duration::ZERO;
+        }
+        let Some(borrower) = self.semaphore.lock().lines.pop_seldom() else {
+            return Duration::ZERO;
+        };
+        let since = Instant::now();
+        self.lent.set(self.lent.get() + 1);
+        let (give_back, given_back) = mpsc::channel();
+        drop(
+            borrower
+                .granted
+                .send(self.semaphore.permit(Some(give_back))),
+        );
+        // The other end is gone only together with the permit.
+        let _ = given_back.recv();
+        since.elapsed()
+    }
+}
+
 impl Drop for FairPermit {
     fn drop(&mut self) {
-        self.0.release();
+        match self.lender.take() {
+            // It waits for this, so that it receives it.
+            Some(lender) => drop(lender.send(())),
+            None => self.semaphore.release(),
+        }
     }
 }
 
@@ -123,7 +180,6 @@ impl State {
             line: line.cloned(),
             arrival,
             granted: receiver,
-            is_settled: false,
         }
     }
 
@@ -138,15 +194,13 @@ impl State {
         }
     }
 
-    /// Takes out one who stops waiting; false if it has been granted a permit already.
-    fn remove(&mut self, line: Option<&Caller>, arrival: u64) -> bool {
-        let is_it = |waiting: &Waiting| waiting.arrival == arrival;
+    /// Takes out one who stops waiting, unless it has been granted a permit already.
+    fn remove(&mut self, line: Option<&Caller>, arrival: u64) {
         match line {
-            Some(caller) => self.lines.remove(caller, is_it),
-            None => match self.behind.iter().position(is_it) {
-                Some(position) => self.behind.remove(position).is_some(),
-                None => false,
-            },
+            Some(caller) => self
+                .lines
+                .remove(caller, |waiting| waiting.arrival == arrival),
+            None => self.behind.retain(|waiting| waiting.arrival != arrival),
         }
     }
 }
@@ -156,53 +210,38 @@ struct Place {
     semaphore: FairSemaphore,
     line: Option<Caller>,
     arrival: u64,
-    granted: oneshot::Receiver<()>,
-    /// Whether there is nothing left to clear up.
-    is_settled: bool,
-}
-
-impl Place {
-    async fn granted(mut self) -> FairPermit {
-        // The sender stays in the line until it sends, so that this cannot fail.
-        let _ = (&mut self.granted).await;
-        self.is_settled = true;
-        FairPermit(self.semaphore.clone())
-    }
+    granted: oneshot::Receiver<FairPermit>,
 }
 
 impl Drop for Place {
+    /// Leaves the line. A permit that was granted at this moment is dropped with the receiver.
     fn drop(&mut self) {
-        if self.is_settled {
-            return;
-        }
-        let was_waiting = self
-            .semaphore
+        self.semaphore
             .lock()
             .remove(self.line.as_ref(), self.arrival);
-        if !was_waiting {
-            self.semaphore.release();
-        }
     }
 }
 
 /// How many newcomers are served in a row while the round waits. Those beyond go to its end.
 const NEWCOMERS_IN_A_ROW: usize = 4;
 
-/// Who had one of so many turns is no newcomer; of more turns while many callers wait.
-const RECENT_TURNS: usize = 16;
+/// So many turns are remembered, to tell how seldom a newcomer asks.
+const REMEMBERED_TURNS: usize = 64;
 
 /// Lines of values, one for each key, that are served in turn.
 struct Turns<K, V> {
     /// No line is empty.
     lines: HashMap<K, VecDeque<V>>,
-    /// Keys that have a line and had no turn lately, the first to come first.
+    /// Keys that have a line and are not in the round, the one that had no turn for the longest
+    /// first.
     newcomers: VecDeque<K>,
-    /// The other keys that have a line, the one whose turn it is first.
+    /// Keys that had a turn, the one whose turn it is first. One without a line stays until the
+    /// round passes it, so that it is no newcomer before everybody else had a turn.
     round: VecDeque<K>,
     /// How many newcomers were served since the round was.
     newcomers_in_a_row: usize,
     /// Who had the last turns, the latest last.
-    recent: VecDeque<K>,
+    history: VecDeque<K>,
 }
 
 impl<K, V> Default for Turns<K, V> {
@@ -212,7 +251,7 @@ impl<K, V> Default for Turns<K, V> {
             newcomers: VecDeque::new(),
             round: VecDeque::new(),
             newcomers_in_a_row: 0,
-            recent: VecDeque::new(),
+            history: VecDeque::new(),
         }
     }
 }
@@ -220,39 +259,52 @@ impl<K, V> Default for Turns<K, V> {
 impl<K: Clone + Eq + Hash, V> Turns<K, V> {
     /// Adds a value to the end of the line of `key`.
     fn push(&mut self, key: K, value: V) {
-        if !self.lines.contains_key(&key) {
-            let waiting = match self.recent.contains(&key) {
-                true => &mut self.round,
-                false => &mut self.newcomers,
-            };
-            waiting.push_back(key.clone());
+        if !self.lines.contains_key(&key) && !self.round.contains(&key) {
+            let last = self.last_turn(&key);
+            let is_later = |other: &K| self.last_turn(other) > last;
+            let place = self.newcomers.iter().position(is_later);
+            let place = place.unwrap_or(self.newcomers.len());
+            self.newcomers.insert(place, key.clone());
         }
         self.lines.entry(key).or_default().push_back(value);
     }
 
-    /// Takes the first value of the line whose turn it is; the line goes to the end of the round.
+    /// When a key had its last turn: the later, the greater; none if that is long ago.
+    fn last_turn(&self, key: &K) -> Option<usize> {
+        self.history.iter().rposition(|other| other == key)
+    }
+
+    /// Takes the first value of the line whose turn it is; its key goes to the end of the round.
     fn pop(&mut self) -> Option<V> {
+        while self
+            .round
+            .front()
+            .is_some_and(|key| !self.lines.contains_key(key))
+        {
+            self.round.pop_front();
+        }
         let key = self.next_key()?;
+        self.take_turn(key)
+    }
+
+    /// Takes the first value of the line of `key`, which goes to the end of the round.
+    fn take_turn(&mut self, key: K) -> Option<V> {
         let line = self.lines.get_mut(&key)?;
         let value = line.pop_front();
         if line.is_empty() {
             self.lines.remove(&key);
-        } else {
-            self.round.push_back(key.clone());
         }
+        self.round.push_back(key.clone());
         self.remember(key);
         value
     }
 
     /// Remembers that `key` had a turn.
     fn remember(&mut self, key: K) {
-        self.recent.push_back(key);
-        // The last of the round waits for so many turns at most. Whoever had one of them is not to
-        // go before it again.
-        let longest_round = (NEWCOMERS_IN_A_ROW + 1) * self.lines.len();
-        while self.recent.len() > RECENT_TURNS.max(longest_round) {
-            self.recent.pop_front();
+        if self.history.len() == REMEMBERED_TURNS {
+            self.history.pop_front();
         }
+        self.history.push_back(key);
     }
 
     /// Takes out the key whose turn it is.
@@ -270,21 +322,32 @@ impl<K: Clone + Eq + Hash, V> Turns<K, V> {
         self.round.pop_front()
     }
 
-    /// Takes the first value of a line for which `is_it` holds out of it; false if there is none.
-    fn remove(&mut self, key: &K, is_it: impl Fn(&V) -> bool) -> bool {
+    /// Takes the first value of the first newcomer, if that asks for less than half of its share:
+    /// if so many turns have passed since its own that each of the others had two.
+    fn pop_seldom(&mut self) -> Option<V> {
+        let newcomer = self.newcomers.front()?;
+        let turns_since = match self.last_turn(newcomer) {
+            Some(last) => self.history.len() - 1 - last,
+            None => self.history.len(),
+        };
+        let others: HashSet<&K> = self.history.iter().filter(|key| *key != newcomer).collect();
+        if turns_since < 2 * others.len().max(1) {
+            return None;
+        }
+        let newcomer = self.newcomers.pop_front()?;
+        self.take_turn(newcomer)
+    }
+
+    /// Takes a value for which `is_it` holds out of the line of `key`, if there is one.
+    fn remove(&mut self, key: &K, is_it: impl Fn(&V) -> bool) {
         let Some(line) = self.lines.get_mut(key) else {
-            return false;
+            return;
         };
-        let Some(position) = line.iter().position(is_it) else {
-            return false;
-        };
-        line.remove(position);
+        line.retain(|value| !is_it(value));
         if line.is_empty() {
             self.lines.remove(key);
             self.newcomers.retain(|other| other != key);
-            self.round.retain(|other| other != key);
         }
-        true
     }
 
     /// The first value of each line.
@@ -442,6 +505,20 @@ mod tests {
     }
 
     #[test]
+    fn of_newcomers_the_one_who_asks_least_is_served_first() {
+        let semaphore = FairSemaphore::new(1);
+        let names: Vec<Caller> = (0..4).map(caller).collect();
+        let ask = |name: usize| (name, queued(semaphore.acquire(&names[name])));
+        // Nobody has to wait, so that the round is empty.
+        for name in [0, 1, 2, 1] {
+            drop(semaphore.acquire(&names[name]).now_or_never());
+        }
+        let held = semaphore.acquire(&caller(9)).now_or_never().unwrap();
+        let waiting = vec![ask(1), ask(2), ask(0), ask(3)];
+        assert_eq!(order_of(held, waiting), [3, 0, 2, 1]);
+    }
+
+    #[test]
     fn newcomers_without_end_do_not_keep_the_round_waiting() {
         let semaphore = FairSemaphore::new(1);
         let names: Vec<Caller> = (0..20).map(caller).collect();
@@ -453,13 +530,77 @@ mod tests {
         let held = granted(&mut first).expect("nobody else waits");
         waiting.extend((1..20).map(ask));
         let order = order_of(held, waiting);
-        assert_eq!(order[..5], [1, 2, 3, 4, 0]);
+        // The first of all was a newcomer, too.
+        assert_eq!(order[..4], [1, 2, 3, 0]);
         let second = order.iter().rposition(|name| *name == 0);
         assert_eq!(
             second,
             Some(20),
             "each newcomer is served before the same one again"
         );
+    }
+
+    #[test]
+    fn a_permit_is_lent_to_one_who_asks_seldom_and_comes_back() {
+        let semaphore = FairSemaphore::new(1);
+        let [often, seldom, other, third] = [0, 1, 2, 3].map(caller);
+        for _ in 0..4 {
+            drop(semaphore.acquire(&often).now_or_never());
+        }
+        let mut lender = semaphore.acquire(&often).now_or_never().unwrap();
+        assert_eq!(lender.lend(), Duration::ZERO, "nobody wants it");
+        let mut same = queued(semaphore.acquire(&often));
+        assert_eq!(lender.lend(), Duration::ZERO, "its own caller has to wait");
+        for borrower in [&seldom, &other] {
+            let mut waiting = queued(semaphore.acquire(borrower));
+            let (given_back, lent) = std::thread::scope(|scope| {
+                let lending = scope.spawn(move || {
+                    let lent = lender.lend();
+                    (lender, lent)
+                });
+                let borrowed = loop {
+                    match granted(&mut waiting) {
+                        Some(borrowed) => break borrowed,
+                        None => std::thread::yield_now(),
+                    }
+                };
+                let waiting = queued(semaphore.acquire(&third));
+                assert_eq!(borrowed.lend(), Duration::ZERO, "it is never lent on");
+                assert!(!lending.is_finished());
+                drop((waiting, borrowed));
+                lending.join().unwrap()
+            });
+            assert!(lent > Duration::ZERO);
+            lender = given_back;
+        }
+        let mut newcomer = queued(semaphore.acquire(&third));
+        assert_eq!(lender.lend(), Duration::ZERO, "it was lent twice already");
+        drop(lender);
+        drop(granted(&mut newcomer).expect("a newcomer goes first"));
+        assert!(granted(&mut same).is_some());
+    }
+
+    #[test]
+    fn a_permit_lent_to_one_who_leaves_comes_back() {
+        let semaphore = FairSemaphore::new(1);
+        let [often, seldom] = [caller(0), caller(1)];
+        for _ in 0..4 {
+            drop(semaphore.acquire(&often).now_or_never());
+        }
+        let lender = semaphore.acquire(&often).now_or_never().unwrap();
+        let leaving = queued(semaphore.acquire(&seldom));
+        std::thread::scope(|scope| {
+            let lending = scope.spawn(move || {
+                lender.lend();
+                lender
+            });
+            while semaphore.lock().lines.fronts().count() > 0 {
+                std::thread::yield_now();
+            }
+            drop(leaving);
+            drop(lending.join().unwrap());
+        });
+        assert!(semaphore.acquire(&often).now_or_never().is_some());
     }
 
     #[test]

@@ -25,6 +25,16 @@ pub trait DescriptorSource: Send + Sync + 'static {
     /// # Errors
     /// The tensors have another shape than the model takes, or its computation fails.
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError>;
+    /// As [`DescriptorSource::describe`], and calls `pause` now and then. Within it another thread
+    /// may use this source, while this call computes nothing.
+    ///
+    /// # Errors
+    /// As [`DescriptorSource::describe`].
+    fn describe_with_pauses(
+        &self,
+        images: &[ImageTensor],
+        pause: &dyn Fn(),
+    ) -> Result<Vec<Descriptor>, ExtractError>;
     /// Bytes of weights in memory.
     fn memory_bytes(&self) -> u64;
 }
@@ -44,6 +54,14 @@ impl DescriptorSource for Extractor {
 
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
         self.extract(images)
+    }
+
+    fn describe_with_pauses(
+        &self,
+        images: &[ImageTensor],
+        pause: &dyn Fn(),
+    ) -> Result<Vec<Descriptor>, ExtractError> {
+        self.extract_with_pauses(images, pause)
     }
 
     fn memory_bytes(&self) -> u64 {

@@ -23,7 +23,7 @@ use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 use std::future::pending;
 use std::path::Path;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 use tempfile::TempDir;
@@ -50,6 +50,8 @@ pub struct FakeSource {
     /// Images described so far.
     pub described: AtomicUsize,
     delay: Mutex<Duration>,
+    /// While true, a description that began alone goes on, and pauses again and again.
+    pub long: AtomicBool,
     pub decoding: Step,
     pub describing: Step,
 }
@@ -160,6 +162,7 @@ impl FakeSource {
             head,
             described: AtomicUsize::new(0),
             delay: Mutex::default(),
+            long: AtomicBool::new(false),
             decoding: Step::default(),
             describing: Step::default(),
         })
@@ -200,7 +203,20 @@ impl DescriptorSource for FakeSource {
     }
 
     fn describe(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
+        self.describe_with_pauses(images, &|| ())
+    }
+
+    fn describe_with_pauses(
+        &self,
+        images: &[ImageTensor],
+        pause: &dyn Fn(),
+    ) -> Result<Vec<Descriptor>, ExtractError> {
+        let is_alone = self.describing.inside() == 0;
         self.describing.run(|| {
+            while is_alone && self.long.load(Ordering::SeqCst) {
+                pause();
+                std::thread::sleep(Duration::from_millis(1));
+            }
             self.described.fetch_add(images.len(), Ordering::SeqCst);
             assert!(
                 images.iter().all(|image| !image.data[0].is_nan()),

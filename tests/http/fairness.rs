@@ -219,3 +219,30 @@ async fn the_worker_serves_the_second_caller_next_whatever_the_first_has_queued(
         query.await.unwrap().ok();
     }
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn who_asks_seldom_is_answered_while_the_work_of_another_goes_on() {
+    let app = service(32);
+    send_as(&app, "builder", "POST", "/references?map=m", Some(1))
+        .await
+        .created();
+    // So many that the other caller has asked for less than half of its share.
+    for seed in 2..6 {
+        send_as(&app, "flood", "POST", "/query?map=m", Some(seed))
+            .await
+            .ok();
+    }
+    app.source.long.store(true, Ordering::SeqCst);
+    let flooding = app.clone();
+    let long =
+        tokio::spawn(
+            async move { send_as(&flooding, "flood", "POST", "/query?map=m", Some(10)).await },
+        );
+    until("an extraction", || app.source.describing.inside() == 1).await;
+    send_as(&app, "seldom", "POST", "/query?map=m", Some(20))
+        .await
+        .ok();
+    assert!(!long.is_finished());
+    app.source.long.store(false, Ordering::SeqCst);
+    long.await.unwrap().ok();
+}

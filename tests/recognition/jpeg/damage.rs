@@ -318,6 +318,29 @@ fn segments_that_are_wrong() {
     assert_refused(&file, "quantisers", "no quantisers");
 }
 
+/// `zune-jpeg` and viewers refuse a DC table with a symbol that is no number of bits, even if no code
+/// of the picture has it; `jpeg-decoder` does not.
+#[test]
+fn a_dc_table_with_a_symbol_that_is_no_number_of_bits() {
+    for layout in [
+        Layout::new(70, 50, Colours::Grey),
+        Layout::new(70, 50, Colours::YCbCr).progressive(),
+    ] {
+        let mut head = layout.head();
+        let table = head.iter_mut().find(|part| part[1] == 0xc4 && part[4] == 0);
+        let table = table.expect("a DC table");
+        // Eleven is the last of its symbols, and no difference of this picture has so many bits.
+        *table.last_mut().unwrap() = 16;
+        let parts = [
+            b"\xff\xd8",
+            &head.concat()[..],
+            &layout.scans().concat(),
+            b"\xff\xd9",
+        ];
+        assert_refused(&parts.concat(), "Huffman table", &format!("{layout:?}"));
+    }
+}
+
 #[test]
 fn a_huffman_table_that_is_missing() {
     let layout = Layout::new(70, 50, Colours::Grey);

@@ -87,6 +87,22 @@ pub trait Encoder: Send + Sync {
     /// # Errors
     /// An image of another size or with too few values, or an output that is not finite.
     fn encode(&self, images: &[ImageTensor]) -> Result<Vec<EncodedImage>, ExtractError>;
+
+    /// As [`Encoder::encode`], and calls `pause` between the blocks, on the calling thread. No
+    /// other thread computes anything for this call meanwhile, so that the caller may let something
+    /// more urgent compute, also with this encoder.
+    ///
+    /// An encoder that cannot stop between blocks never pauses.
+    ///
+    /// # Errors
+    /// As [`Encoder::encode`].
+    fn encode_with_pauses(
+        &self,
+        images: &[ImageTensor],
+        _pause: &dyn Fn(),
+    ) -> Result<Vec<EncodedImage>, ExtractError> {
+        self.encode(images)
+    }
 }
 
 /// Arithmetic of the linear layers.

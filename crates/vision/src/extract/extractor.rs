@@ -145,7 +145,20 @@ impl Extractor {
     /// # Errors
     /// An image of another size than [`Extractor::input_size`], or an output that is not finite.
     pub fn extract(&self, images: &[ImageTensor]) -> Result<Vec<Descriptor>, ExtractError> {
-        let encoded = self.encoder.encode(images)?;
+        self.extract_with_pauses(images, &|| ())
+    }
+
+    /// As [`Extractor::extract`], and calls `pause` between the blocks of the transformer, on the
+    /// calling thread, where the caller may let something more urgent compute.
+    ///
+    /// # Errors
+    /// As [`Extractor::extract`].
+    pub fn extract_with_pauses(
+        &self,
+        images: &[ImageTensor],
+        pause: &dyn Fn(),
+    ) -> Result<Vec<Descriptor>, ExtractError> {
+        let encoded = self.encoder.encode_with_pauses(images, pause)?;
         encoded
             .iter()
             .map(|image| self.describe(image).map(|(descriptor, _)| descriptor))

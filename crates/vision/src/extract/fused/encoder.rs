@@ -117,17 +117,19 @@ impl FusedEncoder {
         plan
     }
 
-    /// Encodes images given as pixels `[3, height, width]` of the spec's size.
+    /// Encodes images given as pixels `[3, height, width]` of the spec's size, and calls `pause`
+    /// between the blocks.
     pub(super) fn encode_pixels(
         &self,
         images: &[&[f32]],
+        pause: &dyn Fn(),
     ) -> Result<Vec<EncodedImage>, ExtractError> {
         if images.is_empty() {
             return Ok(Vec::new());
         }
         let encoded = self
             .workspaces
-            .with(|workspace| self.run(images, workspace));
+            .with(|workspace| self.run(images, workspace, pause));
         if encoded.iter().all(is_finite) {
             Ok(encoded)
         } else {
@@ -136,11 +138,17 @@ impl FusedEncoder {
     }
 
     /// Tokens and CLS attention of every image.
-    fn run(&self, images: &[&[f32]], workspace: &mut Workspace) -> Vec<EncodedImage> {
+    fn run(
+        &self,
+        images: &[&[f32]],
+        workspace: &mut Workspace,
+        pause: &dyn Fn(),
+    ) -> Vec<EncodedImage> {
         let plan = &self.plan_for(images.len());
         let mut encoded: Vec<EncodedImage> = images.iter().map(|_| self.blank()).collect();
         self.embed(plan, images, workspace);
         for (index, block) in self.blocks.iter().enumerate() {
+            pause();
             if index == self.spec.attention_block {
                 for (image, out) in encoded.iter_mut().enumerate() {
                     self.read_attention(&plan.shape, image, workspace, out);
@@ -308,11 +316,19 @@ impl Encoder for FusedEncoder {
     }
 
     fn encode(&self, images: &[ImageTensor]) -> Result<Vec<EncodedImage>, ExtractError> {
+        self.encode_with_pauses(images, &|| ())
+    }
+
+    fn encode_with_pauses(
+        &self,
+        images: &[ImageTensor],
+        pause: &dyn Fn(),
+    ) -> Result<Vec<EncodedImage>, ExtractError> {
         for image in images {
             check_image(image, &self.spec)?;
         }
         let pixels: Vec<&[f32]> = images.iter().map(|image| image.data.as_slice()).collect();
-        self.encode_pixels(&pixels)
+        self.encode_pixels(&pixels, pause)
     }
 }
 

@@ -38,7 +38,7 @@ impl CustomOp1 for FusedEncoder {
 
         let images: Vec<&[f32]> = values[from..to].chunks_exact(3 * height * width).collect();
         let encoded = self
-            .encode_pixels(&images)
+            .encode_pixels(&images, &|| ())
             .map_err(candle_core::Error::wrap)?;
         let shape = (batch, self.token_count(), self.token_and_attention_width());
         let mut out = Vec::with_capacity(shape.0 * shape.1 * shape.2);

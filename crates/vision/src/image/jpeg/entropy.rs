@@ -328,12 +328,11 @@ fn block_tables<'a>(
     needed: TablesNeeded,
     number: usize,
 ) -> Result<BlockTables<'a>, Fault> {
-    let derive = |in_use: TableInUse<'a>| {
-        let stored = in_use.table.ok_or(Fault::TableMissing(number))?;
-        HuffmanTable::new(stored)
-    };
-    let dc = needed.dc.then(|| derive(part.dc)).transpose()?;
-    let ac = needed.ac.then(|| derive(part.ac)).transpose()?;
+    let stored = |in_use: TableInUse<'a>| in_use.table.ok_or(Fault::TableMissing(number));
+    let dc = needed.dc.then(|| stored(part.dc)).transpose()?;
+    let ac = needed.ac.then(|| stored(part.ac)).transpose()?;
+    let dc = dc.map(HuffmanTable::for_dc).transpose()?;
+    let ac = ac.map(HuffmanTable::new).transpose()?;
     // Only a sequential scan needs both tables.
     let steps = ac
         .as_ref()

@@ -52,6 +52,18 @@ impl<'a> HuffmanTable<'a> {
         Ok(table)
     }
 
+    /// As [`HuffmanTable::new`], for the table of the DC differences.
+    ///
+    /// # Errors
+    /// As [`HuffmanTable::new`], or a symbol that is no number of bits. Viewers refuse such a table
+    /// even if no code of the picture has that symbol.
+    pub fn for_dc(stored: StoredTable<'a>) -> Result<Self, Fault> {
+        if stored.symbols.iter().any(|&symbol| symbol > 15) {
+            return Err(Fault::BadTable);
+        }
+        Self::new(stored)
+    }
+
     fn enter(&mut self, length: u32, code: u32, place: usize) {
         if length > LOOKUP_BITS {
             return;
