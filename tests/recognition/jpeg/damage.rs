@@ -115,6 +115,7 @@ fn missing_scans() {
             Scan::new(&[0, 1], (1, 5), (0, 0)),
         ),
         ("two bits at once", Scan::new(&[0], (1, 5), (3, 1))),
+        ("all bits left", Scan::new(&[0], (1, 5), (0, 8))),
     ] {
         let file = progressive(vec![all.clone(), scan]).encode();
         assert_refused(&file, "wrong parameters", name);

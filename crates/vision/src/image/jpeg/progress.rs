@@ -8,8 +8,9 @@ use super::frame::{Frame, Scan};
 /// scan.
 pub(super) struct Progress(Vec<[Option<u8>; COEFFICIENTS]>);
 
-/// The standard's limit on the bits that a progressive picture may leave to later scans.
-const MAX_LOW: u8 = 13;
+/// Most bits that a scan may leave to later ones. The standard allows 13, of which `jpeg-decoder`
+/// refuses those beyond the eight of a sample; encoders leave two or three.
+const MAX_LOW: u8 = 7;
 
 impl Progress {
     pub fn new(frame: &Frame) -> Self {
