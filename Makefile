@@ -5,7 +5,7 @@ SHELL := bash
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
 # What `make test` and CI run, cheapest first.
-TEST_STEPS := fmt promtool deny clippy unit doc schemathesis compose
+TEST_STEPS := fmt promtool deny clippy unit doc client-test schemathesis compose
 PYTHON ?= python3
 FUZZ_SECONDS ?= 60
 # `make soak SECONDS=60`. The shell has a variable of that name, which is not meant.
@@ -105,6 +105,10 @@ promtool: ## Prometheus configuration and alert rules
 schemathesis: model ## Generated requests against a live server
 	BIN=$(DEBUG_BIN) tests/schemathesis.sh
 
+.PHONY: client-test
+client-test: model ## The Python client: types, wheel, tests and examples against a live server
+	BIN=$(DEBUG_BIN) clients/python/check.sh
+
 .PHONY: compose
 compose: model ## The composed system end to end (skips without Docker)
 	$(PYTHON) tests/compose/run.py --binary $(DEBUG_BIN)
@@ -134,7 +138,7 @@ asan: ## The kernels' tests under AddressSanitizer
 
 .PHONY: clean
 clean: ## Remove everything made here
-	rm -rf target .venv .tools demo-report fuzz/target fuzz/corpus
+	rm -rf target .venv .venv-client .tools demo-report fuzz/target fuzz/corpus
 
 # Pinned tools in a virtual environment of the project's own.
 .venv/tools: tests/tools.txt
