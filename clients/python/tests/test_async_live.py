@@ -7,7 +7,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 
 import pytest
 
-from conftest import Server, facade
+from facades import facade
+from live_server import Server
 from placeformer import AsyncClient, Conflict, ImageRefused, NewPhoto, NotFound
 
 

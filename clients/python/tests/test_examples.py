@@ -11,7 +11,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from conftest import ROOT, Server
+from conftest import ROOT
+from live_server import Server
 from placeformer import Client
 
 EXAMPLES = ROOT / "examples"

@@ -9,7 +9,8 @@ import numpy
 import pytest
 from PIL import Image
 
-from conftest import draw_facade, facade
+from conftest import draw_facade
+from facades import facade
 from placeformer._images import encode
 
 

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy
 import pytest
 
-from conftest import KEY, Server, draw_facade, facade
+from conftest import READ_KEY, draw_facade
+from facades import facade
+from live_server import Server
 from placeformer import (
     Client,
     Conflict,
@@ -156,7 +158,7 @@ def test_a_key_opens_what_its_role_allows(locked_server: Server, map_name: str) 
         with Client(locked_server.url, api_key=key) as client, pytest.raises(NotAuthorised) as no:
             client.maps()
         assert no.value.code == "unauthorized"
-    with Client(locked_server.url, api_key=KEY) as client:
+    with Client(locked_server.url, api_key=READ_KEY) as client:
         assert client.maps() == []
         with pytest.raises(NotAuthorised) as no:
             client.add_reference(facade(1), map_name)

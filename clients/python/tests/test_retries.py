@@ -11,7 +11,7 @@ from email.utils import format_datetime
 import httpx
 import pytest
 
-from conftest import facade
+from facades import facade
 from placeformer import (
     ApiError,
     AsyncClient,
