@@ -109,6 +109,10 @@ schemathesis: model ## Generated requests against a live server
 client-test: model ## The Python client: types, wheel, tests and examples against a live server
 	BIN=$(DEBUG_BIN) clients/python/check.sh
 
+.PHONY: console-test
+console-test: model ## The console in a headless Chromium (needs chromium installed)
+	BIN=$(DEBUG_BIN) tests/console/run.sh
+
 .PHONY: compose
 compose: model ## The composed system end to end (skips without Docker)
 	$(PYTHON) tests/compose/run.py --binary $(DEBUG_BIN)
@@ -138,7 +142,7 @@ asan: ## The kernels' tests under AddressSanitizer
 
 .PHONY: clean
 clean: ## Remove everything made here
-	rm -rf target .venv .venv-client .tools demo-report fuzz/target fuzz/corpus
+	rm -rf target .venv .venv-tests .tools demo-report fuzz/target fuzz/corpus
 
 # Pinned tools in a virtual environment of the project's own.
 .venv/tools: tests/tools.txt

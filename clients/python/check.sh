@@ -3,21 +3,13 @@
 # against a live server.
 #
 #   BIN=path/to/placeformer   the program to test against
-#   VENV=dir                  Python environment, made where it is missing (default: .venv-client)
+#   VENV=dir                  Python environment (default: .venv-tests)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 root=$(cd ../.. && pwd)
-venv="${VENV:-$root/.venv-client}"
 PLACEFORMER="$(realpath "${BIN:?names the program to test against}")"
 export PLACEFORMER
-
-# The environment is made anew when the list of its packages has changed.
-if ! cmp --silent tests/requirements.txt "$venv/requirements.txt"; then
-  rm -rf "$venv"
-  python3 -m venv "$venv"
-  "$venv/bin/pip" install --quiet --disable-pip-version-check -r tests/requirements.txt
-  cp tests/requirements.txt "$venv/requirements.txt"
-fi
+venv="$("$root/tests/python_env.sh")"
 export PATH="$venv/bin:$PATH" PYTHONDONTWRITEBYTECODE=1
 
 settings="$PWD/pyproject.toml"

@@ -394,6 +394,22 @@ async fn the_service_describes_itself() {
     let page = app.get("/docs/").await;
     assert!(page.status == 200 && page.text.contains("swagger"));
     assert!(app.get("/docs/swagger-ui-bundle.js").await.status == 200);
+    let console = app.get("/").await;
+    assert!(console.status == 200 && console.text.contains("/console/js/main.js"));
+    let policy = console.header("content-security-policy");
+    assert!(
+        policy.starts_with("default-src 'none'; script-src 'self';"),
+        "{policy}"
+    );
+    let script = app.get("/console/js/main.js").await;
+    let kind = script.header("content-type");
+    assert_eq!(
+        (script.status.as_u16(), kind),
+        (200, "text/javascript; charset=utf-8")
+    );
+    assert_eq!(script.header("content-security-policy"), policy);
+    let missing = app.get("/console/js/../../Cargo.toml").await;
+    missing.problem("route_not_found");
     let head = app
         .send(Request::head("/info").body(Body::empty()).unwrap())
         .await;
