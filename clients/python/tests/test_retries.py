@@ -188,7 +188,7 @@ def test_a_photo_is_not_sent_twice_unless_that_is_safe(
 
 def test_answers_of_others_are_no_answers(run: Callable[..., PlaceFormerError | None]) -> None:
     for answer in (
-        httpx.Response(502, text="<html>bad gateway</html>"),
+        httpx.Response(404, text="<html>nothing here</html>"),
         httpx.Response(200, json={"version": 7}),
         httpx.Response(200, text="hello"),
         httpx.Response(302, headers={"location": "http://elsewhere/"}),
@@ -196,6 +196,19 @@ def test_answers_of_others_are_no_answers(run: Callable[..., PlaceFormerError | 
         script = Script(answer)
         assert isinstance(run(script), UnexpectedAnswer)
         assert script.asked == 1
+
+
+def test_a_proxy_that_cannot_reach_the_service_is_asked_again(
+    run: Callable[..., PlaceFormerError | None],
+) -> None:
+    gateway = httpx.Response(502, text="<html>bad gateway</html>")
+    script = Script(gateway, OK)
+    assert run(script) is None
+    assert script.asked == 2
+    # It may have reached it, so that a photo without a name might be stored twice.
+    script = Script(gateway)
+    assert isinstance(run(script, store=True), UnexpectedAnswer)
+    assert script.asked == 1
 
 
 def test_a_code_of_a_newer_service_is_an_error_all_the_same(

@@ -31,7 +31,16 @@ class ConnectionFailed(PlaceFormerError):
 
 
 class UnexpectedAnswer(PlaceFormerError):
-    """An answer arrived that is not the service's, or that this version does not understand."""
+    """An answer arrived that is not the service's, or that this version does not understand.
+
+    Attributes:
+        status: The HTTP status.
+
+    """
+
+    def __init__(self, message: str, *, status: int) -> None:
+        super().__init__(message)
+        self.status = status
 
 
 class Problem(msgspec.Struct, frozen=True, kw_only=True):
@@ -146,6 +155,6 @@ def error_of(response: httpx.Response, retry_after: float | None) -> PlaceFormer
     try:
         problem = _PROBLEM_DECODER.decode(response.content)
     except msgspec.MsgspecError:
-        start = response.text[:200]
-        return UnexpectedAnswer(f"status {response.status_code}, which is no problem: {start!r}")
+        status, start = response.status_code, response.text[:200]
+        return UnexpectedAnswer(f"status {status}, which is no problem: {start!r}", status=status)
     return ERROR_CLASSES.get(problem.code, ApiError)(problem, retry_after)

@@ -10,7 +10,16 @@ import io
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, Union, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Final,
+    NamedTuple,
+    Protocol,
+    Union,
+    cast,
+    runtime_checkable,
+)
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -96,7 +105,8 @@ def _image_of_array(array: SupportsArrayInterface) -> PIL.Image.Image:
     except ImportError as error:
         message = "arrays are encoded with Pillow: pip install placeformer[images]"
         raise TypeError(message) from error
-    return PIL.Image.fromarray(array)
+    # What Pillow demands of the type differs between versions; what it needs was checked above.
+    return PIL.Image.fromarray(cast("Any", array))
 
 
 def _encoded(image: PIL.Image.Image) -> EncodedImage:

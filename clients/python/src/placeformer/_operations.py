@@ -76,7 +76,7 @@ def decoded(kind: type[T]) -> Callable[[httpx.Response], T]:
             return decoder.decode(response.content)
         except msgspec.MsgspecError as error:
             message = f"the answer is no {kind.__name__}: {error}"
-            raise UnexpectedAnswer(message) from error
+            raise UnexpectedAnswer(message, status=response.status_code) from error
 
     return read
 

@@ -13,11 +13,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
-from ._errors import ApiError, ConnectionFailed, PlaceFormerError
+from ._errors import ApiError, ConnectionFailed, PlaceFormerError, UnexpectedAnswer
 
 #: Statuses that a service gives before it has begun with a request, so that sending it again
 #: cannot do it twice.
 _NOTHING_WAS_DONE = frozenset({408, 429, 503, 507})
+
+#: Statuses with which a proxy says that the service behind it cannot be reached now.
+_OF_PROXIES = frozenset({502, 503, 504})
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,8 @@ def _may_pass(error: PlaceFormerError, *, is_repeatable: bool) -> bool:
         return error.retryable and (is_repeatable or error.status in _NOTHING_WAS_DONE)
     if isinstance(error, ConnectionFailed):
         return is_repeatable or not error.may_have_arrived
-    return False
+    is_of_proxy = isinstance(error, UnexpectedAnswer) and error.status in _OF_PROXIES
+    return is_of_proxy and is_repeatable
 
 
 def parse_retry_after(headers: Mapping[str, str]) -> float | None:
