@@ -93,7 +93,7 @@ function drawPatches(context, box, pair, side, scales) {
     const [right, bottom] = onCanvas(box, [x + half, y + half], pair.input_size);
     // Attention falls off steeply, so that its logarithm is shown.
     const share = Math.log1p(patch.attention) / Math.log1p(strongest);
-    context.globalAlpha = 0.08 + 0.27 * share;
+    context.globalAlpha = 0.04 + 0.16 * share;
     context.fillStyle = SCALE_COLOURS[patch.scale];
     context.fillRect(left, top, right - left, bottom - top);
     context.globalAlpha = 0.35 + 0.65 * share;
