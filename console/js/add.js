@@ -16,6 +16,9 @@ const WORKERS = 3;
 /** So many verdicts at most are listed; the counts have all. */
 const MOST_VERDICTS = 500;
 
+/** Milliseconds between two sentences about the progress, which are read aloud to some. */
+const SENTENCE_PERIOD = 2000;
+
 /** Refusals that every further photo would meet, too. */
 const OF_ALL = ["unauthorized", "forbidden", "model_mismatch", "disk_full", "storage_lost"];
 
@@ -118,6 +121,7 @@ class Progress {
     this.total = total;
     this.counts = { added: 0, present: 0, refused: 0, left: 0 };
     this.started = performance.now();
+    this.said = -Infinity;
     byId("verdicts").replaceChildren();
     byId("add-progress").max = Math.max(total, 1);
     this.#show();
@@ -145,6 +149,10 @@ class Progress {
     const { added, present, refused } = this.counts;
     const done = added + present + refused;
     byId("add-progress").value = done;
+    if (performance.now() - this.said < SENTENCE_PERIOD) {
+      return;
+    }
+    this.said = performance.now();
     const seconds = (performance.now() - this.started) / 1000;
     const rate = seconds > 0 ? done / seconds : 0;
     const rest = rate > 0 ? `, about ${Math.ceil((this.total - done) / rate)} s left` : "";

@@ -63,6 +63,11 @@ export function showAnswer(frame) {
   fill(place, verdict(frame), explanation(frame), ranking(frame, evidence), evidence, stages(frame));
 }
 
+/** Says what became of a frame to those who do not see the page. */
+export function sayAnswer(frame) {
+  byId("answer-state").textContent = `${frame.photo.name}: ${verdictOf(frame)[0]}`;
+}
+
 /** The verdict in a few words, with the class of its colour. */
 export function verdictOf({ answer, error }) {
   if (error) {

@@ -1,7 +1,7 @@
 // The tab that asks where photos were taken: one, or all of a drive, one after the other.
 
 import { query } from "./api.js";
-import { showAnswer, start as startAnswer, verdictOf } from "./answer.js";
+import { sayAnswer, showAnswer, start as startAnswer, verdictOf } from "./answer.js";
 import { acceptFiles, byId, element } from "./dom.js";
 import * as format from "./format.js";
 import { remember, thumbnail } from "./pictures.js";
@@ -94,6 +94,7 @@ async function ask(frame) {
   const note = frame.button.querySelector("small");
   note.textContent = text;
   note.className = kind;
+  sayAnswer(frame);
   if (frame === current) {
     choose(frame);
   }

@@ -117,6 +117,7 @@ def test_a_drive_is_asked_about_photo_by_photo(
     notes = page.locator("#frames small")
     expect(notes).to_have_count(4)
     expect(notes.last).to_have_text("failed")
+    expect(page.locator("#answer-state")).to_have_text("broken.png: failed")
     page.locator("#frames button").nth(2).click()
     expect(page.locator(".ranks button").first).to_contain_text("1. front-3.png")
     page.locator("#frames button").nth(3).click()
