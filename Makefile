@@ -5,7 +5,7 @@ SHELL := bash
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
 # What `make test` and CI run, cheapest first.
-TEST_STEPS := fmt promtool deny clippy unit doc schemathesis compose
+TEST_STEPS := fmt promtool deny clippy unit doc client-test console-test schemathesis compose
 PYTHON ?= python3
 FUZZ_SECONDS ?= 60
 # `make soak SECONDS=60`. The shell has a variable of that name, which is not meant.
@@ -25,6 +25,7 @@ help: ## Show this list
 
 .PHONY: demo
 demo: ## Serve a demo map, query it, leave a report in demo-report/
+	@[ -x $(RELEASE_BIN) ] || echo "Compiling takes seven to ten minutes on two cores, the first time only."
 	cargo build --release --locked
 	$(RELEASE_BIN) demo --out demo-report
 
@@ -105,6 +106,14 @@ promtool: ## Prometheus configuration and alert rules
 schemathesis: model ## Generated requests against a live server
 	BIN=$(DEBUG_BIN) tests/schemathesis.sh
 
+.PHONY: client-test
+client-test: model ## The Python client: types, wheel, tests and examples against a live server
+	BIN=$(DEBUG_BIN) clients/python/check.sh
+
+.PHONY: console-test
+console-test: model ## The console in a headless Chromium (CI installs it, others must)
+	BIN=$(DEBUG_BIN) tests/console/run.sh
+
 .PHONY: compose
 compose: model ## The composed system end to end (skips without Docker)
 	$(PYTHON) tests/compose/run.py --binary $(DEBUG_BIN)
@@ -134,7 +143,7 @@ asan: ## The kernels' tests under AddressSanitizer
 
 .PHONY: clean
 clean: ## Remove everything made here
-	rm -rf target .venv .tools demo-report fuzz/target fuzz/corpus
+	rm -rf target .venv .venv-tests .tools demo-report fuzz/target fuzz/corpus
 
 # Pinned tools in a virtual environment of the project's own.
 .venv/tools: tests/tools.txt

@@ -45,7 +45,7 @@ fuzz_target!(|text: &str| {
     {
         assert!((1..=MAX_PAGE).contains(&limit));
     }
-    accepted(&uri, MatchParams::checked);
+    accepted(&uri, |params: MatchParams| params.reference());
     accepted(&uri, |params: ReadyParams| Ok(params));
 });
 

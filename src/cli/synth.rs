@@ -25,7 +25,12 @@ pub struct SynthArgs {
     #[arg(long, default_value = "640x480", value_parser = parse_size)]
     size: ImageSize,
     /// Conditions of the queries, in turn; references are taken by day.
-    #[arg(long, value_delimiter = ',', default_values_t = [Condition::Dusk, Condition::Overcast, Condition::Day])]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        num_args = 1..,
+        default_values_t = [Condition::Dusk, Condition::Overcast, Condition::Day]
+    )]
     conditions: Vec<Condition>,
 }
 

@@ -218,6 +218,11 @@ pub(super) fn match_answer() -> Value {
                 "inlier": true,
             }],
         }},
+        "key_patches": {
+            "patch_size": 14,
+            "query": [{"centre": [105.0, 91.0], "scale": 1, "attention": 3.2}],
+            "reference": [{"centre": [91.0, 91.0], "scale": 1, "attention": 2.9}],
+        },
         "input_size": {"width": 448, "height": 336},
         "timings_ms": {"decode": 11.9, "queue": 0.4, "extract": 381.0, "rerank": 1.1},
         "model": MODEL,

@@ -165,7 +165,9 @@ fn images_body(upload: &ImageUpload) -> Value {
     }
     json!({
         "required": true,
-        "description": "The image as it is, in a form, or in JSON.",
+        "description": "The image as it is, in a form, or in JSON. A body without a content type, \
+            or with the type `application/x-www-form-urlencoded` that curl gives to everything, is \
+            taken for an image if its bytes are one.",
         "content": {
             "image/jpeg": bytes_content(),
             "image/png": bytes_content(),

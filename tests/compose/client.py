@@ -1,12 +1,9 @@
-"""HTTP against the composed system, and test images: the standard library only."""
+"""HTTP against the composed system: the standard library only."""
 
 import http.client
 import json
-import random
-import struct
 import time
 import urllib.parse
-import zlib
 
 
 class Refused(Exception):
@@ -84,28 +81,3 @@ def references(port, map_name):
         cursor = page["next"]
         if not cursor:
             return found
-
-
-def facade(seed, width=320, height=240):
-    """A PNG of a house front that no other seed gives: coloured walls, windows, doors and signs."""
-    dice = random.Random(seed)
-    rows = [bytearray(bytes(dice.randrange(60, 220) for _ in range(3)) * width) for _ in range(height)]
-
-    def rectangle(x, y, w, h, colour):
-        for line in rows[max(0, y) : min(height, y + h)]:
-            end = min(width, x + w)
-            line[3 * x : 3 * end] = bytes(colour) * (end - x)
-
-    for _ in range(40):
-        x, y = dice.randrange(width - 12), dice.randrange(height - 12)
-        colour = [dice.randrange(256) for _ in range(3)]
-        rectangle(x, y, dice.randrange(8, 70), dice.randrange(8, 60), colour)
-    return png(width, height, b"".join(b"\0" + bytes(row) for row in rows))
-
-
-def png(width, height, rows):
-    def chunk(kind, body):
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows, 6)) + chunk(b"IEND", b"")

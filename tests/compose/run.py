@@ -15,8 +15,10 @@ import threading
 import time
 import traceback
 
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent))
+HERE = pathlib.Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parent)]
 import client
+from facades import facade
 from stack import Stack, run, why_not_here
 
 MAP = "compose"
@@ -33,7 +35,7 @@ class Checks:
 
     def __init__(self, stack):
         self.stack = stack
-        self.pictures = {f"front-{seed:03}": client.facade(seed) for seed in range(IMAGES)}
+        self.pictures = {f"front-{seed:03}": facade(seed) for seed in range(IMAGES)}
         self.acknowledged = {}
 
     def starts_healthy_and_confined(self):
@@ -112,7 +114,7 @@ class Checks:
                 if stop.is_set():
                     return
                 try:
-                    _, reference = client.ingest(self.stack.port, MAP, f"front-{seed:03}", client.facade(seed))
+                    _, reference = client.ingest(self.stack.port, MAP, f"front-{seed:03}", facade(seed))
                 except (OSError, client.Refused, client.http.client.HTTPException):
                     return
                 with lock:

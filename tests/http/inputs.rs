@@ -504,6 +504,13 @@ async fn what_no_handler_sees_is_a_problem_too() {
         ),
         (
             "POST",
+            "/query?map=m",
+            "application/x-www-form-urlencoded",
+            b"image=photo.jpg".to_vec(),
+            "unsupported_media_type",
+        ),
+        (
+            "POST",
             "/query",
             "multipart/form-data",
             vec![1],

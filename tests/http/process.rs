@@ -12,7 +12,7 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
 use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 // Without crash points the server would outlive what is to kill it, and the tests would prove
@@ -254,6 +254,17 @@ impl Server {
         let mut child = self.child.lock().unwrap();
         child.kill().unwrap();
         child.wait().unwrap();
+    }
+}
+
+/// A server that no test killed would outlive the tests, and keep open whatever they were given.
+impl Drop for Server {
+    fn drop(&mut self) {
+        let child = self.child.get_mut();
+        let child = child.unwrap_or_else(PoisonError::into_inner);
+        // It may have died by itself, which the test has then reported.
+        let _ = child.kill();
+        let _ = child.wait();
     }
 }
 

@@ -93,6 +93,18 @@ async fn an_image_may_come_raw_as_multipart_or_as_base64() {
     assert_eq!(found.ok()["results"][0]["reference_id"], created.json["id"]);
 }
 
+/// `curl --data-binary @photo.jpg` calls the photo a form, and others say nothing about it.
+#[tokio::test]
+async fn an_image_without_a_type_of_its_own_is_taken_for_one() {
+    let app = App::new();
+    let form = "application/x-www-form-urlencoded";
+    let created = app.post("/references?map=m", form, picture(1)).await;
+    created.created();
+    let request = Request::post("/query?map=m").body(Body::from(picture(1)));
+    let found = app.send(request.unwrap()).await;
+    assert_eq!(found.ok()["results"][0]["reference_id"], created.json["id"]);
+}
+
 #[tokio::test]
 async fn a_query_is_answered_with_ranked_evidence() {
     let app = App::new();
@@ -331,8 +343,42 @@ async fn two_images_or_an_image_and_a_reference_are_matched() {
         (&first["reference"], &json!(1))
     );
     assert_eq!(pair.json["input_size"], json!({"width": 112, "height": 84}));
+    assert_eq!(pair.json["key_patches"], Value::Null);
     let json = json!({"query": STANDARD.encode(picture(1)), "reference_id": id}).to_string();
     app.post("/match", "application/json", json).await.ok();
+}
+
+#[tokio::test]
+async fn a_match_lists_the_key_patches_of_both_images_where_it_is_asked_to() {
+    let app = App::new();
+    let images: [(&str, &[u8]); 2] = [("query", &picture(1)), ("reference", &picture(2))];
+    let (kind, body) = multipart(&images);
+    let answer = app.post("/match?key_patches=true", &kind, body).await;
+    let size = &answer.ok()["input_size"];
+    let patches = &answer.json["key_patches"];
+    let side = patches["patch_size"].as_f64().unwrap();
+    for image in ["query", "reference"] {
+        let listed = patches[image].as_array().unwrap();
+        assert!(!listed.is_empty(), "{image}");
+        for patch in listed {
+            let half = side * patch["scale"].as_f64().unwrap() / 2.0;
+            for (axis, length) in [(0, "width"), (1, "height")] {
+                let centre = patch["centre"][axis].as_f64().unwrap();
+                let end = size[length].as_f64().unwrap();
+                assert!(centre >= half && centre + half <= end, "{image}: {patch}");
+            }
+            assert!(patch["attention"].as_f64().unwrap() > 0.0, "{patch}");
+        }
+    }
+    // What is matched is among the key patches.
+    let pairs = &answer.json["combinations"]["s11"]["correspondences"];
+    for pair in pairs.as_array().unwrap() {
+        for image in ["query", "reference"] {
+            let mut listed = patches[image].as_array().unwrap().iter();
+            let found = listed.any(|patch| patch["scale"] == 1 && patch["centre"] == pair[image]);
+            assert!(found, "{image}: {pair}");
+        }
+    }
 }
 
 #[tokio::test]
@@ -348,6 +394,22 @@ async fn the_service_describes_itself() {
     let page = app.get("/docs/").await;
     assert!(page.status == 200 && page.text.contains("swagger"));
     assert!(app.get("/docs/swagger-ui-bundle.js").await.status == 200);
+    let console = app.get("/").await;
+    assert!(console.status == 200 && console.text.contains("/console/js/main.js"));
+    let policy = console.header("content-security-policy");
+    assert!(
+        policy.starts_with("default-src 'none'; script-src 'self';"),
+        "{policy}"
+    );
+    let script = app.get("/console/js/main.js").await;
+    let kind = script.header("content-type");
+    assert_eq!(
+        (script.status.as_u16(), kind),
+        (200, "text/javascript; charset=utf-8")
+    );
+    assert_eq!(script.header("content-security-policy"), policy);
+    let missing = app.get("/console/js/../../Cargo.toml").await;
+    missing.problem("route_not_found");
     let head = app
         .send(Request::head("/info").body(Body::empty()).unwrap())
         .await;

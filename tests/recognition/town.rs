@@ -97,4 +97,11 @@ fn the_demo_runs_to_its_report() {
         "{said}"
     );
     assert!(folder.path().join("shown/match-1.png").exists());
+    // Pictures lead, and places have names that a person would give them.
+    assert!(page.find("data:image/") < page.find("<table"));
+    assert!(page.contains("Query of place ") && page.contains("<svg"));
+    assert!(
+        !page.contains("@359"),
+        "names of files are no names for a person"
+    );
 }

@@ -6,6 +6,7 @@
 //! product that works.
 
 mod report;
+mod town;
 
 use super::client::{ServerArgs, ServerClient, TrustArgs};
 use crate::cli::child_server::ChildServer;
@@ -14,7 +15,7 @@ use crate::cli::progress::ProgressBars;
 use anyhow::{Context, bail, ensure};
 use placeformer_models::resolve_weights;
 use placeformer_vision::extract::ExtractConfig;
-use report::{Asked, Evidence};
+use report::{Asked, Demo, Evidence};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
@@ -77,7 +78,15 @@ pub fn run(args: DemoArgs) -> anyhow::Result<()> {
     let info = client.get("/info")?;
     server.stop()?;
     let path = args.out.join("index.html");
-    report::write(&path, &town, &asked, &evidence, &info, import_seconds)?;
+    let demo = Demo {
+        town: &town,
+        references: &file_names(&town.join("database"))?,
+        asked: &asked,
+        evidence: &evidence,
+        info: &info,
+        import_seconds,
+    };
+    report::write(&path, &demo)?;
 
     say!("\n{}", report::summary(&asked))?;
     say!("report: {}", path.display())?;
@@ -167,6 +176,17 @@ fn placeformer(arguments: &[&str]) -> anyhow::Result<()> {
         arguments.first().copied().unwrap_or_default()
     );
     Ok(())
+}
+
+/// The names of the files in a folder.
+fn file_names(folder: &Path) -> anyhow::Result<Vec<String>> {
+    let cannot_read = || format!("cannot read {}", folder.display());
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(folder).with_context(cannot_read)? {
+        let name = entry.with_context(cannot_read)?.file_name();
+        names.push(name.to_string_lossy().into_owned());
+    }
+    Ok(names)
 }
 
 fn text(path: &Path) -> anyhow::Result<&str> {

@@ -1,9 +1,9 @@
-//! What the demo showed: a table on the terminal, a page with pictures.
+//! What the demo showed: a table on the terminal, a page that leads with pictures.
 
+use super::town::{Mark, map, place_and_view};
 use crate::cli::output::{OutputError, say};
 use anyhow::Context;
 use maud::{Markup, html};
-use placeformer_core::geography::UtmName;
 use placeformer_lab::draw::{jpeg_data_uri, thumbnail};
 use placeformer_lab::eval::report::{page, table};
 use placeformer_vision::image::{ImageConfig, decode};
@@ -112,6 +112,15 @@ impl Asked {
         })
     }
 
+    /// What the map shows of it.
+    pub(super) fn mark(&self) -> Mark {
+        match (self.mapped, self.right()) {
+            (false, _) => Mark::Unmapped,
+            (true, true) => Mark::Right,
+            (true, false) => Mark::Wrong,
+        }
+    }
+
     fn verdict(&self) -> &'static str {
         match (self.mapped, self.right(), self.globally_right()) {
             (false, ..) => "not in the map",
@@ -125,7 +134,7 @@ impl Asked {
 /// A line per query.
 pub(super) fn print_table(asked: &[Asked]) -> Result<(), OutputError> {
     say!(
-        "   {:<12} {:<14} {:>5} {:>6} {:>9} {:>8} {:>8}  verdict",
+        "   {:<19} {:<19} {:>5} {:>6} {:>9} {:>8} {:>8}  verdict",
         "query",
         "best reference",
         "S",
@@ -141,7 +150,7 @@ pub(super) fn print_table(asked: &[Asked]) -> Result<(), OutputError> {
             .map_or("-".into(), |best| place_and_view(&best.reference));
         let stage = |name: &str| one.stages.get(name).copied().unwrap_or_default();
         say!(
-            "   {:<12} {best:<14} {:>5} {:>6} {:>6.0} ms {:>5.2} ms {:>5.0} ms  {}",
+            "   {:<19} {best:<19} {:>5} {:>6} {:>6.0} ms {:>5.2} ms {:>5.0} ms  {}",
             place_and_view(&one.query),
             one.best_score(),
             one.confidence(),
@@ -152,11 +161,6 @@ pub(super) fn print_table(asked: &[Asked]) -> Result<(), OutputError> {
         )?;
     }
     Ok(())
-}
-
-/// The part of a photo's name that tells it apart, for a terminal's width: place and view.
-fn place_and_view(name: &str) -> String {
-    UtmName::parse(name).map_or_else(|_| name.to_owned(), |parts| parts.pano_id)
 }
 
 /// The demo in a few sentences.
@@ -197,27 +201,38 @@ pub(super) fn summary(asked: &[Asked]) -> String {
     text
 }
 
-/// Writes the page.
-pub(super) fn write(
-    path: &Path,
-    town: &Path,
-    asked: &[Asked],
-    evidence: &[Evidence],
-    info: &Value,
-    import_seconds: f64,
-) -> anyhow::Result<()> {
+/// What the page is about.
+pub(super) struct Demo<'a> {
+    /// The folder of the town.
+    pub(super) town: &'a Path,
+    /// The mapped photos.
+    pub(super) references: &'a [String],
+    /// Every query with its answer.
+    pub(super) asked: &'a [Asked],
+    /// The pictures of some.
+    pub(super) evidence: &'a [Evidence],
+    /// The answer of `/info`.
+    pub(super) info: &'a Value,
+    /// How long importing took.
+    pub(super) import_seconds: f64,
+}
+
+/// Writes the page: the summary and a map of the town, then pictures, then every query.
+pub(super) fn write(path: &Path, demo: &Demo<'_>) -> anyhow::Result<()> {
+    let Demo { town, asked, .. } = *demo;
+    let info = demo.info;
     let model = &info["model"];
     let model = model["id"].as_str().or(model.as_str()).unwrap_or("unknown");
     let mut figures = Vec::new();
-    for one in evidence {
+    for one in demo.evidence {
         figures.push(figure(town, &asked[one.asked], &one.picture)?);
     }
+    let seconds = format!("{:.1}", demo.import_seconds);
     let body = html! {
-        p.lead { (summary(asked)) }
-        p {
-            "Model " code { (model) } "; importing took " (format!("{import_seconds:.1}")) " s."
+        @for sentence in summary(asked).lines() {
+            p.lead { (sentence) }
         }
-        (all_queries(asked))
+        (map(demo.references, asked))
         h2 { "The evidence" }
         p {
             "Above: attention, with the key patches of three scales as squares. Below, for each \
@@ -226,6 +241,9 @@ pub(super) fn write(
         @for figure in figures {
             (figure)
         }
+        h2 { "All queries" }
+        p.soft { "Model " code { (model) } "; importing took " (seconds) " s." }
+        (all_queries(asked))
     };
     std::fs::write(path, page("PlaceFormer demo", &body))
         .with_context(|| format!("cannot write {}", path.display()))
@@ -233,13 +251,13 @@ pub(super) fn write(
 
 fn all_queries(asked: &[Asked]) -> Markup {
     let name = |found: Option<&Found>| match found {
-        Some(found) => found.reference.clone(),
+        Some(found) => place_and_view(&found.reference),
         None => "-".into(),
     };
     let row = |one: &Asked| {
         let total: f64 = one.stages.values().sum();
         vec![
-            one.query.clone(),
+            place_and_view(&one.query),
             name(one.global_best()),
             name(one.results.first()),
             one.best_score().to_string(),
@@ -272,21 +290,22 @@ fn figure(town: &Path, asked: &Asked, picture: &Path) -> anyhow::Result<Markup> 
     {
         if let Some(found) = found {
             let class = if found.right { "right" } else { "wrong" };
+            let caption = format!("{caption}: {}", place_and_view(&found.reference));
             references.push(photo(
                 &town.join("database"),
                 &found.reference,
-                caption,
+                &caption,
                 class,
             )?);
         }
     }
     let alt = format!(
         "Key patches and inlier lines of {} and its best reference",
-        asked.query
+        place_and_view(&asked.query)
     );
     let uri = embed(picture, 1400)?;
     Ok(html! {
-        h3 { (asked.query) " \u{2014} " (asked.verdict()) }
+        h3 { "Query of " (place_and_view(&asked.query)) ": " (asked.verdict()) }
         div.row {
             (query)
             @for reference in references {
@@ -302,7 +321,7 @@ fn photo(folder: &Path, name: &str, caption: &str, class: &str) -> anyhow::Resul
     let uri = embed(&folder.join(name), 420)?;
     Ok(html! {
         figure class=(class) {
-            img src=(uri) alt=(name);
+            img src=(uri) alt=(place_and_view(name));
             figcaption { (caption) }
         }
     })

@@ -2,7 +2,8 @@
 //!
 //! An image comes in one of three ways: as the raw body with parameters in the query string; as
 //! multipart, with parameters in a part named `json` or in the query string; as JSON with the image
-//! in base64 beside the parameters.
+//! in base64 beside the parameters. A raw body without a type of its own is taken for an image if
+//! its bytes begin as one.
 //!
 //! Taking a body apart is work, which is done on threads of its own ([`codec`](super::codec)).
 //!
@@ -27,12 +28,17 @@ use json::split_json;
 use multipart::split_multipart;
 use parts::{BodyParts, JsonObject, MAX_PARAMETER_BYTES};
 use placeformer_core::error::ErrorCode;
+use placeformer_vision::image;
 use receive::{ReceivedBody, receive};
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 use std::collections::HashMap;
 use utoipa::openapi::RefOr;
 use utoipa::openapi::schema::Schema;
+
+/// The types that a body of images may have.
+const UPLOAD_TYPES: &str = "one of image/jpeg, image/png, image/webp, application/octet-stream, \
+     multipart/form-data, application/json";
 
 /// Largest body without an image, in bytes.
 pub const MAX_JSON_BYTES: usize = 256 << 10;
@@ -118,18 +124,33 @@ pub async fn read_upload<P: DeserializeOwned + Send + 'static>(
             state.codec.run(workload, split).await
         }
         Some("image/jpeg" | "image/png" | "image/webp" | "application/octet-stream") => {
-            let params = parameters_of(&uri, None)?;
-            let received = receive(state, request, state.max_image_bytes).await?;
-            let image = received.reservation.attach_one(received.bytes);
-            let images = names.iter().copied().zip([image]).collect();
-            Ok(UploadedImages { images, params })
+            read_raw_image(state, request, names).await
         }
-        _ => Err(unsupported_type(
-            kind.as_deref(),
-            "one of image/jpeg, image/png, image/webp, application/octet-stream, \
-             multipart/form-data, application/json",
-        )),
+        // What clients send that do not know the type: `curl --data-binary` calls everything a form.
+        None | Some("application/x-www-form-urlencoded") => {
+            let upload = read_raw_image(state, request, names).await?;
+            let is_image = |bytes: &Bytes| image::is_image(bytes);
+            if !upload.images.values().all(is_image) {
+                let expected = format!("{UPLOAD_TYPES}, and the body is no JPEG, PNG or WebP");
+                return Err(unsupported_type(kind.as_deref(), &expected));
+            }
+            Ok(upload)
+        }
+        _ => Err(unsupported_type(kind.as_deref(), UPLOAD_TYPES)),
     }
+}
+
+/// Reads a body that is the first of the images, as it is.
+async fn read_raw_image<P: DeserializeOwned>(
+    state: &AppState,
+    request: Request,
+    names: &'static [&'static str],
+) -> Result<UploadedImages<P>, ApiError> {
+    let params = parameters_of(request.uri(), None)?;
+    let received = receive(state, request, state.max_image_bytes).await?;
+    let image = received.reservation.attach_one(received.bytes);
+    let images = names.iter().copied().zip([image]).collect();
+    Ok(UploadedImages { images, params })
 }
 
 /// Reads a JSON object without images, of at most [`MAX_JSON_BYTES`].

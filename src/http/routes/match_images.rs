@@ -11,7 +11,7 @@ use axum::Extension;
 use axum::extract::{Request, State};
 use axum::http::StatusCode;
 use axum::response::Response;
-use placeformer_core::types::ReferenceId;
+use placeformer_core::types::{PackedPatches, ReferenceId};
 use placeformer_vision::rerank::CombinationMatch;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -34,14 +34,18 @@ pub struct MatchParams {
     #[schema(format = Uuid)]
     #[param(format = Uuid)]
     pub reference_id: Option<String>,
+    /// Whether the answer lists the key patches of both images, too. By default it does not.
+    #[schema(default = false)]
+    #[param(example = true)]
+    pub key_patches: Option<bool>,
 }
 
 impl MatchParams {
-    /// Checks what the types cannot.
+    /// The stored reference to match against, if one is named.
     ///
     /// # Errors
     /// `invalid_parameter` if the id is not one.
-    pub fn checked(self) -> Result<Option<ReferenceId>, ApiError> {
+    pub fn reference(&self) -> Result<Option<ReferenceId>, ApiError> {
         Ok(self.reference_id.as_deref().map(str::parse).transpose()?)
     }
 }
@@ -54,6 +58,8 @@ pub struct MatchAnswerBody {
     /// By scale combination: `s11`, `s12`, `s23`, ...
     #[schema(value_type = std::collections::HashMap<String, CombinationMatchBody>)]
     pub combinations: BTreeMap<String, CombinationMatchBody>,
+    /// All key patches of both images; null unless `key_patches` asks for them.
+    pub key_patches: Option<KeyPatchesBody>,
     /// Positions are pixels of images of this size; both images were resized to it.
     pub input_size: SizeBody,
     /// Milliseconds per stage.
@@ -94,6 +100,29 @@ pub struct CorrespondenceBody {
     pub inlier: bool,
 }
 
+/// The key patches of a pair: what was compared.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct KeyPatchesBody {
+    /// Side of a patch of scale 1 in pixels; those of scale 2 and 3 are 2 and 3 times as wide.
+    pub patch_size: u16,
+    /// Those of the query image, by scale, then by attention from the highest.
+    pub query: Vec<KeyPatchBody>,
+    /// Those of the reference image, in the same order.
+    pub reference: Vec<KeyPatchBody>,
+}
+
+/// One key patch.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct KeyPatchBody {
+    /// Centre in the image, x and y in pixels.
+    #[schema(min_items = 2, max_items = 2)]
+    pub centre: [f32; 2],
+    /// Its scale: 1, 2 or 3.
+    pub scale: usize,
+    /// Attention that the model pays to it, in multiples of what an even share would be.
+    pub attention: f32,
+}
+
 /// Match two images
 ///
 /// Send the images as the multipart parts `query` and `reference`, as base64 in JSON under the same
@@ -121,7 +150,8 @@ pub async fn match_images(
     let service = state.service()?;
     let mut upload = read_upload::<MatchParams>(&state, request, &UPLOAD).await?;
     let query = upload.take("query")?;
-    let reference_id = std::mem::take(&mut upload.params).checked()?;
+    let reference_id = upload.params.reference()?;
+    let with_key_patches = upload.params.key_patches.unwrap_or(false);
     let other = match (upload.take_optional("reference")?, reference_id) {
         (Some(image), None) => MatchTarget::Image(image),
         (None, Some(id)) => {
@@ -137,12 +167,12 @@ pub async fn match_images(
     let answer = service.match_images(&access.caller, query, other).await?;
     let timings = answer.timings.clone();
     timed(&state, StatusCode::OK, &timings, move || {
-        answer_body(&answer)
+        answer_body(&answer, with_key_patches)
     })
     .await
 }
 
-fn answer_body(answer: &MatchAnswer) -> MatchAnswerBody {
+fn answer_body(answer: &MatchAnswer, with_key_patches: bool) -> MatchAnswerBody {
     let mut spatial_score = 0;
     let mut combinations = BTreeMap::new();
     for combination in &answer.matched.combinations {
@@ -153,6 +183,7 @@ fn answer_body(answer: &MatchAnswer) -> MatchAnswerBody {
     MatchAnswerBody {
         spatial_score,
         combinations,
+        key_patches: with_key_patches.then(|| key_patches_body(&answer.matched)),
         input_size: SizeBody {
             width: answer.input_size.width,
             height: answer.input_size.height,
@@ -181,4 +212,24 @@ fn combination_body(pair: &MatchedPair, combination: &CombinationMatch) -> Combi
         homography: combination.homography.map(|matrix| matrix.to_vec()),
         correspondences,
     }
+}
+
+fn key_patches_body(pair: &MatchedPair) -> KeyPatchesBody {
+    KeyPatchesBody {
+        patch_size: pair.query.grid.patch_px,
+        query: key_patches_of(&pair.query),
+        reference: key_patches_of(&pair.reference),
+    }
+}
+
+fn key_patches_of(patches: &PackedPatches) -> Vec<KeyPatchBody> {
+    let mut bodies = Vec::with_capacity(patches.len());
+    for row in 0..patches.len() {
+        bodies.push(KeyPatchBody {
+            centre: patches.centre(row),
+            scale: patches.scale_of(row),
+            attention: patches.attention[row].to_f32(),
+        });
+    }
+    bodies
 }

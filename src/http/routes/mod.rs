@@ -7,6 +7,7 @@
 //! The attributes of a handler repeat its method and path, because their macro insists; a test
 //! compares them with the row.
 
+pub mod console;
 pub mod docs;
 pub mod info;
 pub mod maps;
@@ -279,6 +280,26 @@ pub static ROUTES: &[Route] = &[
         own_errors: &[],
         answer_example: Some(examples::openapi_json),
         handler: Handler::Operation(|| routes!(docs::openapi_json)),
+    },
+    Route {
+        method: Method::GET,
+        path: "/",
+        scope: Scope::Public,
+        access_log: AccessLog::Logged,
+        body: RequestBody::None,
+        own_errors: &[],
+        answer_example: None,
+        handler: Handler::Page(|| get(console::index)),
+    },
+    Route {
+        method: Method::GET,
+        path: "/console/{*rest}",
+        scope: Scope::Public,
+        access_log: AccessLog::Logged,
+        body: RequestBody::None,
+        own_errors: &[ErrorCode::RouteNotFound],
+        answer_example: None,
+        handler: Handler::Page(|| get(console::file)),
     },
     Route {
         method: Method::GET,

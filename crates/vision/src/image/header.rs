@@ -49,20 +49,30 @@ pub(super) fn recognise(bytes: &[u8], config: &ImageConfig) -> Result<ImageForma
             limit: config.max_bytes,
         });
     }
+    format_of(bytes).ok_or_else(|| ImageError::UnknownFormat {
+        found: describe(bytes),
+    })
+}
+
+/// Whether bytes begin as an image does that can be decoded, whatever a sender calls them.
+pub fn is_image(bytes: &[u8]) -> bool {
+    format_of(bytes).is_some()
+}
+
+/// The format that the first bytes name.
+fn format_of(bytes: &[u8]) -> Option<ImageFormat> {
     // A file that ends within its magic bytes is a truncated image of that format, not one of an
     // unknown format. A single byte is too little to tell.
     let begins_with =
         |magic: &[u8]| bytes.len() >= 2 && (bytes.starts_with(magic) || magic.starts_with(bytes));
     if begins_with(JPEG_MAGIC) {
-        Ok(ImageFormat::Jpeg)
+        Some(ImageFormat::Jpeg)
     } else if begins_with(PNG_MAGIC) {
-        Ok(ImageFormat::Png)
+        Some(ImageFormat::Png)
     } else if bytes.starts_with(b"RIFF") && bytes.get(8..12) == Some(b"WEBP") {
-        Ok(ImageFormat::WebP)
+        Some(ImageFormat::WebP)
     } else {
-        Err(ImageError::UnknownFormat {
-            found: describe(bytes),
-        })
+        None
     }
 }
 

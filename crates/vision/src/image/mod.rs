@@ -40,6 +40,7 @@ pub use config::ImageConfig;
 pub use encode::{encode_jpeg, encode_png};
 pub use error::ImageError;
 pub use exif::{ExifInfo, ExifSources, MetadataBlock, read_exif};
+pub use header::is_image;
 pub use load::{decode, load_tensor};
 pub use resize::{DEVIATION, MEAN};
 pub use rgb::RgbImage;
