@@ -94,9 +94,15 @@ doc: ## Examples in the documentation, and its links
 	  cargo doc --locked --workspace --no-deps --document-private-items --quiet
 
 .PHONY: model
-model: ## Obtain the model's weights
+ifdef LONDON
+model:
+	cargo build --release --locked
+	LONDON="$(LONDON)" CAMVID="$(CAMVID)" PLACEFORMER=$(RELEASE_BIN) models/make_model.sh
+else
+model: ## Obtain the model's weights; with LONDON=DIR CAMVID=DIR train on them (models/)
 	cargo build --locked
 	$(DEBUG_BIN) model pull $(MODEL)
+endif
 
 .PHONY: promtool
 promtool: ## Prometheus configuration and alert rules

@@ -6,7 +6,10 @@
 #
 # CAMVID names a folder with one folder of frames per drive, in order (the four CamVid drives were
 # used). It must never be a data set on which recall is reported. The program contains the new
-# calibration from its next build on.
+# calibration from its next build on. Further variables:
+#
+#   MODEL_FLAGS  another model, such as `--difference FILE --head FILE`
+#   OUT          where its calibration is written
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 placeformer=${PLACEFORMER:-target/release/placeformer}
@@ -15,6 +18,8 @@ if [ -z "${CAMVID:-}" ] || [ ! -d "$CAMVID" ]; then
   echo "(the four CamVid drives were used)${CAMVID:+; there is no $CAMVID}" >&2
   exit 1
 fi
+read -ra flags <<<"${MODEL_FLAGS:-}"
+out=$(realpath -m "${OUT:-models/dinov2-vits14-b8.calibration.json}")
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 # Town 1 is among the pictures that the head was fitted on, and town 7 is the demo's.
@@ -23,6 +28,6 @@ for town in 11 12 13; do
 done
 python3 models/calibration_data.py "$work/data" --drives "$CAMVID" \
   --town "$work/town11" --town "$work/town12" --stranger "$work/town13"
-"$placeformer" eval calibrate --dataset csv --root "$work/data" \
+"$placeformer" eval calibrate "${flags[@]}" --dataset csv --root "$work/data" \
   --data-name "four CamVid drives and two drawn towns, with stretches and a town that are not mapped" \
-  --out models/dinov2-vits14-b8.calibration.json
+  --out "$out"

@@ -55,6 +55,9 @@ struct InfoArgs {
     /// Attention heads, where a file's weights were trained with another count than the preset's.
     #[arg(long)]
     heads: Option<usize>,
+    /// Difference to be merged with the weights.
+    #[arg(long, value_name = "FILE")]
+    difference: Option<PathBuf>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -78,10 +81,11 @@ fn info(args: InfoArgs) -> anyhow::Result<()> {
     let config = ExtractConfig {
         preset,
         heads: args.heads,
+        difference: args.difference.clone(),
         ..ExtractConfig::default()
     };
     let record = verify_weights(&path)?;
-    let weights = VitWeights::load(&path, preset, args.heads)?;
+    let weights = config.load_weights(&path)?;
     let (extractor, head) = with_built_in_head(&config, &weights)?;
     let sha256 = match &record {
         Some(record) => record.sha256.clone(),
@@ -94,6 +98,7 @@ fn info(args: InfoArgs) -> anyhow::Result<()> {
         "source": record.map(|record| record.source),
         "sha256": sha256,
         "content_sha256": weights.content_hash(),
+        "difference_sha256": weights.merged.as_ref().map(|merged| &merged.difference),
         "parameters": weights.parameters() + weights.unused_parameters,
         "parameters_unused": weights.unused_parameters,
         "geometry": weights.geometry,

@@ -15,6 +15,9 @@ pub struct ModelOptions {
     /// Weights file; the preset's own are pulled on first use otherwise.
     #[arg(long, env = "PLACEFORMER_WEIGHTS", value_name = "FILE")]
     pub weights: Option<PathBuf>,
+    /// Difference to the weights, as `train` writes it; it is merged with them.
+    #[arg(long, value_name = "FILE")]
+    pub difference: Option<PathBuf>,
     /// Projection to the global descriptor: default, none, or a file.
     #[arg(long, value_name = "HEAD", default_value_t)]
     pub head: HeadChoice,
@@ -61,6 +64,7 @@ impl ModelOptions {
         let mut config = ExtractConfig {
             preset: self.preset,
             weights: self.weights.clone(),
+            difference: self.difference.clone(),
             head: self.head.clone(),
             input_size: self.input_size,
             exit_block: self.exit_block,

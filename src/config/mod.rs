@@ -150,12 +150,16 @@ impl Config {
         let ModelOverrides {
             preset,
             weights,
+            difference,
             head,
             precision,
         } = model;
         set(&mut self.extract.preset, preset);
         if weights.is_some() {
             self.extract.weights = weights;
+        }
+        if difference.is_some() {
+            self.extract.difference = difference;
         }
         set(&mut self.extract.head, head);
         set(&mut self.extract.precision, precision);

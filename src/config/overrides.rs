@@ -38,6 +38,9 @@ pub struct ModelOverrides {
     /// first use otherwise.
     #[arg(long, env = "PLACEFORMER_WEIGHTS", value_name = "FILE")]
     pub weights: Option<PathBuf>,
+    /// Difference to the weights, as `train` writes it; it is merged with them.
+    #[arg(long, value_name = "FILE")]
+    pub difference: Option<PathBuf>,
     /// Projection to the global descriptor: default, or a file.
     #[arg(long, value_name = "HEAD")]
     pub head: Option<HeadChoice>,
@@ -61,6 +64,7 @@ impl Overrides {
                 self.model.weights.is_some(),
                 "--weights or PLACEFORMER_WEIGHTS",
             ),
+            "extract.difference" => (self.model.difference.is_some(), "--difference"),
             "extract.head" => (self.model.head.is_some(), "--head"),
             "extract.precision" => (self.model.precision.is_some(), "--precision"),
             _ => return None,

@@ -26,6 +26,7 @@ fn the_file_changes_what_it_names_and_flags_win() {
     std::fs::write(&path, "[http]\nlisten = \"[::1]:1\"\nmax_page = 7\n").unwrap();
     let model = ModelOverrides {
         weights: Some("own.safetensors".into()),
+        difference: Some("difference.safetensors".into()),
         head: Some(HeadChoice::File("head.safetensors".into())),
         ..Default::default()
     };
@@ -36,6 +37,10 @@ fn the_file_changes_what_it_names_and_flags_win() {
     };
     let config = Config::load(Some(&path), &overrides).unwrap();
     assert_eq!(config.extract.weights, Some("own.safetensors".into()));
+    assert_eq!(
+        config.extract.difference,
+        Some("difference.safetensors".into())
+    );
     assert_eq!(
         config.extract.head,
         HeadChoice::File("head.safetensors".into())
@@ -120,6 +125,7 @@ fn the_printed_configuration_reads_back_the_same() {
     let effective = config.extract.effective().unwrap();
     config.extract = ExtractConfig {
         heads: Some(6),
+        difference: Some("difference.safetensors".into()),
         ..effective
     };
     let printed = config.to_annotated_toml().unwrap();

@@ -7,7 +7,9 @@ use crate::common::weights::made_up;
 use placeformer_core::progress::Silent;
 use placeformer_core::types::{GLOBAL_DIM, ImageSize};
 use placeformer_models::open_extractor;
-use placeformer_vision::extract::{Aggregate, ExtractConfig, Head, HeadChoice, Preset, VitWeights};
+use placeformer_vision::extract::{
+    Aggregate, Difference, ExtractConfig, Head, HeadChoice, Preset, VitWeights,
+};
 use std::path::PathBuf;
 use std::process::Command;
 
@@ -129,6 +131,64 @@ fn weights_and_head_of_ones_own_are_served_and_imported_with() {
             "{answer}"
         );
     }
+}
+
+#[test]
+fn a_difference_is_merged_and_part_of_the_model_and_refused_by_other_weights() {
+    let own = Own::new();
+    let mut trained = weights();
+    trained.blocks[11].proj.bias[3] += 0.5;
+    let difference = Difference::between(&weights(), &trained, Default::default()).unwrap();
+    difference
+        .save(&own.path("difference.safetensors"))
+        .unwrap();
+    let serve = [words(SERVE), words("--weights weights.safetensors")].concat();
+    // The head is that of the weights without the difference.
+    let with_difference = [serve.clone(), words("--difference difference.safetensors")].concat();
+    let wrong_head = [with_difference.clone(), words("--head head.safetensors")].concat();
+    let error = refused_by(&mut own.command(&wrong_head));
+    let part = format!(":d{}", &difference.content_hash()[..12]);
+    assert!(
+        error.contains("was fitted for") && error.contains(&part),
+        "{error}"
+    );
+
+    let head = Head::load(&own.path("head.safetensors")).unwrap();
+    let hash = weights().content_hash();
+    let bound = head
+        .backbone()
+        .replace(&hash[..12], &format!("{}{part}", &hash[..12]));
+    let (weight, bias) = head.weights();
+    let head = Head::new(
+        Aggregate::Mean,
+        weight.to_vec(),
+        bias.to_vec(),
+        bound.clone(),
+        Default::default(),
+    );
+    head.unwrap().save(&own.path("bound.safetensors")).unwrap();
+    let with_head = [with_difference, words("--head bound.safetensors")].concat();
+    let server = Server::start(own.command(&with_head));
+    let model = server.get("/info")["model"].to_string();
+    assert!(model.contains(&bound) && model != own.model, "{model}");
+
+    let other = made_up(
+        Preset::PlaceformerVits16,
+        Preset::PlaceformerVits16.geometry(),
+        (14, 14),
+        8,
+    );
+    let another = Difference::between(&other, &weights(), Default::default()).unwrap();
+    another.save(&own.path("another.safetensors")).unwrap();
+    let refused = [
+        serve,
+        words("--difference another.safetensors --head bound.safetensors"),
+    ];
+    let error = refused_by(&mut own.command(&refused.concat()));
+    assert!(
+        error.contains("belongs to weights") && error.contains(&hash),
+        "{error}"
+    );
 }
 
 #[test]

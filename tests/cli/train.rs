@@ -1,9 +1,18 @@
 //! `train`, `head train`, `head fit` and `map rehead` from flags to files, on a small drawn town.
 #![cfg(feature = "lab")]
 
-use crate::common::program::{SIZE, command, has_model, refusal, succeeds, town, words};
+use crate::common::noise::values;
+use crate::common::program::{SIZE, command, has_model, prints, refusal, succeeds, town, words};
+use placeformer_core::progress::Silent;
+use placeformer_core::types::GLOBAL_DIM;
+use placeformer_models::open_extractor;
 use placeformer_store::{ReadPlaces, SqliteStore, StoreConfig};
-use placeformer_vision::extract::{Aggregate, Head, Preset, VitWeights};
+use placeformer_vision::extract::{
+    Aggregate, Difference, ExtractConfig, Head, HeadChoice, NetVlad, NetVladParameters, Preset,
+    VitWeights,
+};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 use std::path::Path;
 
 /// `train` on the town for 20 steps, with further arguments.
@@ -155,6 +164,124 @@ fn the_last_block_is_trained_on_varied_images_of_drives() {
     assert_eq!(Head::load(&head).unwrap().backbone(), bound);
 }
 
+/// A head of a NetVLAD with made-up values for the stock weights, in the file `start.safetensors`:
+/// a fitted one would need more images than a test has.
+fn made_up_netvlad(folder: &Path) {
+    let extract = ExtractConfig {
+        head: HeadChoice::None,
+        ..ExtractConfig::default()
+    };
+    let backbone = open_extractor(&extract, &Silent)
+        .unwrap()
+        .backbone()
+        .to_owned();
+    let mut random = ChaCha8Rng::seed_from_u64(3);
+    let mut some = |count: usize| values(&mut random, count, 0.5);
+    let parameters = NetVladParameters {
+        mean: some(384),
+        projection: some(8 * 384),
+        words: some(4 * 8),
+        assignment: some(4 * 8),
+    };
+    let aggregate = Aggregate::NetVlad(Box::new(NetVlad::new(parameters).unwrap()));
+    let head = Head::new(
+        aggregate,
+        some(GLOBAL_DIM * 32),
+        some(GLOBAL_DIM),
+        backbone,
+        [].into(),
+    );
+    head.unwrap()
+        .save(&folder.join("start.safetensors"))
+        .unwrap();
+}
+
+#[test]
+fn the_recipe_for_streets_writes_a_difference_that_is_evaluated_and_imported_with() {
+    if !has_model() {
+        return;
+    }
+    let folder = town("8", "2");
+    let folder = folder.path();
+    made_up_netvlad(folder);
+    for (out, more) in [("whole", ""), ("adapted", "--rank 2 --learning-rate 1e-3")] {
+        let line = format!(
+            "train --recipe streets --trainable last-1 --dataset csv --root town --steps 2 \
+             --mine-every 1 --batch 4 --images-at-once 3 --cached-views 2 --token-cache tokens \
+             --refit none --average 0.5 --keep last --validation-share 0.3 \
+             --positive-metres 10 --negative-metres 25 \
+             --head start.safetensors --out {out} {more} --input-size {SIZE}"
+        );
+        let (said, noted) = prints(folder, &words(&line));
+        assert!(said.contains("difference.safetensors"), "{said}");
+        assert!(
+            noted.contains("GB are free"),
+            "what the cache costs: {noted}"
+        );
+        let run = folder.join(out);
+        let settings = std::fs::read_to_string(run.join("settings.json")).unwrap();
+        for knob in [
+            "info_nce",
+            "temperature",
+            "average",
+            "hard_pairs",
+            "10 m and 40 degrees",
+        ] {
+            assert!(settings.contains(knob), "{knob}: {settings}");
+        }
+        // The head is bound to the weights and to the difference that was written with it.
+        let difference = Difference::load(&run.join("difference.safetensors")).unwrap();
+        let bound = format!(
+            "dinov2-vits14:{}:d{}:b8",
+            &difference.base()[..12],
+            &difference.content_hash()[..12]
+        );
+        assert_eq!(
+            Head::load(&run.join("head.safetensors"))
+                .unwrap()
+                .backbone(),
+            bound
+        );
+        let model = format!(
+            "--difference {out}/difference.safetensors --head {out}/head.safetensors \
+             --input-size {SIZE}"
+        );
+        let line = format!("eval --dataset csv --root town --no-rerank --cache eval {model}");
+        let evaluated = succeeds(folder, &words(&line));
+        assert!(evaluated.contains(&bound), "{evaluated}");
+    }
+    let size = |out: &str| {
+        let path = folder.join(out).join("difference.safetensors");
+        std::fs::metadata(path).unwrap().len()
+    };
+    assert!(size("whole") < 4_000_000, "{}", size("whole"));
+    assert!(size("adapted") < 60_000, "{}", size("adapted"));
+    // Without the difference the head is refused.
+    let line = format!(
+        "eval --dataset csv --root town --no-rerank --head whole/head.safetensors --input-size {SIZE}"
+    );
+    assert!(refusal(folder, &words(&line)).contains("was fitted for"));
+}
+
+#[test]
+fn a_part_of_the_ground_is_named_by_training_and_evaluation_alike() {
+    let folder = town("8", "1");
+    let folder = folder.path();
+    // The drawn street is shorter than a block.
+    for line in [
+        "train --recipe streets --dataset csv --root town --by-parts --out x",
+        "eval --dataset csv --root town --hold-out report",
+    ] {
+        let error = refusal(folder, &words(line));
+        assert!(error.contains("one block of 500 m"), "{line}: {error}");
+    }
+    let unknown = refusal(
+        folder,
+        &words("eval --dataset csv --root town --hold-out east"),
+    );
+    assert!(unknown.contains("selection"), "{unknown}");
+}
+
 #[test]
 fn what_cannot_be_trained_is_refused_before_the_model_is_loaded() {
     let folder = town("8", "1");
@@ -185,8 +312,20 @@ fn what_cannot_be_trained_is_refused_before_the_model_is_loaded() {
             "nothing to learn from",
         ),
         (
-            "head train --out x --dataset csv --root town --positive-m 30",
+            "head train --out x --dataset csv --root town --positive-metres 30",
             "no order",
+        ),
+        (
+            "train --out x --drives town/database --rank 4",
+            "has no blocks",
+        ),
+        (
+            "train --out x --drives town/database --recipe streets --viewpoint 0.1",
+            "does not vary",
+        ),
+        (
+            "train --out x --drives town/database --trainable last-10",
+            "cannot be trained",
         ),
         ("head fit --images empty --out x", "no images"),
         (

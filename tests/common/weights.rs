@@ -19,6 +19,7 @@ pub fn made_up(
     VitWeights {
         preset,
         unused_parameters: 0,
+        merged: None,
         geometry,
         position_grid,
         blocks: (0..geometry.depth)

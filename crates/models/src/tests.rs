@@ -361,6 +361,7 @@ fn zero_weights() -> VitWeights {
         blocks: (0..geometry.depth).map(|_| block()).collect(),
         norm: norm(),
         unused_parameters: 0,
+        merged: None,
     }
 }
 

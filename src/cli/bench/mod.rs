@@ -13,7 +13,7 @@ use end_to_end::{EndToEnd, EndToEndRow};
 use placeformer_core::progress::{Progress, Task};
 use placeformer_lab::bench::{Bench, BenchError, BenchRow, Limits, NAMES};
 use placeformer_models::resolve_weights;
-use placeformer_vision::extract::{ExtractError, Extractor, VitWeights};
+use placeformer_vision::extract::{ExtractError, Extractor};
 use serde::Serialize;
 use service::PipelineServices;
 use std::path::{Path, PathBuf};
@@ -101,7 +101,7 @@ pub fn run(args: BenchArgs) -> anyhow::Result<()> {
     }
     let config = args.model.extract_config()?;
     let path = resolve_weights(&config, &ProgressBars::default())?;
-    let weights = VitWeights::load(&path, config.preset, config.heads)?;
+    let weights = config.load_weights(&path)?;
     let extractor = Arc::new(Extractor::from_weights(&config, &weights, &config.head)?);
     let (folder, _temporary) = folder(args.data.as_deref())?;
     let limits = Limits::measure(simd);

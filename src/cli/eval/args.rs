@@ -5,7 +5,8 @@ use crate::cli::data_args::ReadArgs;
 use crate::cli::output::note;
 use anyhow::{bail, ensure};
 use placeformer_core::types::ScaleSet;
-use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions};
+use placeformer_lab::choice::Choice;
+use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions, GroundPart};
 use placeformer_lab::eval::features::{Describe, FeatureCache, GlobalKind};
 use placeformer_vision::extract::Preset;
 use placeformer_vision::rerank::RerankConfig;
@@ -42,6 +43,10 @@ pub(super) struct DataArgs {
     /// Where that data set lies.
     #[arg(long, value_name = "DIR", requires = "dataset")]
     pub(super) root: Option<PathBuf>,
+    /// Only this part of the ground: blocks of 500 m that share no place with those of another
+    /// part. `train --by-parts` learns from `train`, validates on `selection` and never sees `report`.
+    #[arg(long, value_name = "PART", value_parser = choice::<GroundPart>())]
+    pub(super) hold_out: Option<GroundPart>,
     #[command(flatten)]
     pub(super) reading: ReadArgs,
     /// Greatest distance of a positive in metres.
@@ -167,6 +172,16 @@ impl DataArgs {
             datasets::load(kind, root, &options)?
         } else {
             bail!("give --dataset and --root, or --database, --queries and --ground-truth");
+        };
+        let dataset = match self.hold_out {
+            Some(part) => {
+                let name = format!("{}, part {}", dataset.name, part.as_str());
+                Dataset {
+                    name,
+                    ..part.of(&dataset)?
+                }
+            }
+            None => dataset,
         };
         note!(
             "{}: {} references, {} queries",

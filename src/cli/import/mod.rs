@@ -263,13 +263,15 @@ fn refuse_model_options(model: &ModelOverrides) -> anyhow::Result<()> {
     let ModelOverrides {
         preset,
         weights: _,
+        difference,
         head,
         precision,
     } = model;
-    let is_given = preset.is_some() || head.is_some() || precision.is_some();
+    let is_given =
+        preset.is_some() || difference.is_some() || head.is_some() || precision.is_some();
     ensure!(
         !is_given,
-        "--preset, --head and --precision go with --data: a server has its own model"
+        "--preset, --difference, --head and --precision go with --data: a server has its own model"
     );
     Ok(())
 }

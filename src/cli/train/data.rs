@@ -1,11 +1,14 @@
 //! What is learnt from and what is held out, from the flags.
 
+use super::method::{MethodArgs, Recipe};
 use crate::cli::choice::choice;
 use crate::cli::data_args::ReadArgs;
 use crate::cli::output::note;
 use anyhow::{Context, ensure};
-use placeformer_lab::datasets::{DatasetKind, DatasetOptions, Split};
-use placeformer_lab::train::{Holdout, Sources, TripletRule, TripletSet, refuse_shared_images};
+use placeformer_lab::datasets::{DatasetKind, DatasetOptions, GroundPart, Split};
+use placeformer_lab::train::{
+    Holdout, Reach, Sources, TripletRule, TripletSet, refuse_shared_images,
+};
 use std::path::{Path, PathBuf};
 
 /// Images to learn from; several sets may be given at once.
@@ -30,18 +33,27 @@ pub(super) struct TrainData {
     /// neighbours show the same place.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     drives: Vec<PathBuf>,
-    /// Greatest distance of a positive (paper: 10).
-    #[arg(long, default_value_t = 10.0, value_name = "METRES")]
-    positive_m: f64,
-    /// Distance beyond which an image is a negative (paper: 25).
-    #[arg(long, default_value_t = 25.0, value_name = "METRES")]
-    negative_m: f64,
+    /// Greatest distance of a positive (paper: 10) [default: 10; 15 with --recipe streets].
+    #[arg(long, value_name = "METRES")]
+    positive_metres: Option<f64>,
+    /// Greatest difference of headings of a positive, where both are known [default: no rule; 40
+    /// with --recipe streets].
+    #[arg(long, value_name = "DEGREES")]
+    positive_degrees: Option<f64>,
+    /// Distance beyond which an image is a negative; what lies between is neither (paper: 25)
+    /// [default: 25; 40 with --recipe streets].
+    #[arg(long, value_name = "METRES")]
+    negative_metres: Option<f64>,
     /// Greatest frame distance of a positive in a drive.
     #[arg(long, default_value_t = 2, value_name = "FRAMES")]
     positive_frames: usize,
     /// Frame distance beyond which an image of the same drive is a negative.
     #[arg(long, default_value_t = 15, value_name = "FRAMES")]
     negative_frames: usize,
+    /// Learn from the part `train` of the ground and validate on the part `selection`, so that the
+    /// part `report`, a quarter, is never seen; `eval --hold-out` names the same parts.
+    #[arg(long, conflicts_with_all = ["validation_dataset", "validation_drives"])]
+    by_parts: bool,
     /// Share of the images held out for validation: whole blocks of ground, and the end of each
     /// drive. Images within the negative distance of a held-out one are not learnt from.
     #[arg(long, default_value_t = 0.2, value_name = "SHARE")]
@@ -79,7 +91,7 @@ pub(super) struct Sides {
 
 impl TrainData {
     /// Reads all sets and splits them by place.
-    pub(super) fn load(&self, seed: u64) -> anyhow::Result<Sides> {
+    pub(super) fn load(&self, method: &MethodArgs) -> anyhow::Result<Sides> {
         let split = self.reading.split.unwrap_or(Split::Train);
         let options = DatasetOptions {
             split: Some(split),
@@ -87,12 +99,15 @@ impl TrainData {
         };
         let given = read(&self.dataset, &self.root, &options, &self.drives)?;
         let explicit = !(self.validation_dataset.is_empty() && self.validation_drives.is_empty());
+        let rule = self.rule(method.recipe);
         let (training, validation) = if explicit {
             (given, self.read_validation()?)
+        } else if self.by_parts {
+            let part = |part| given.part(part, rule.negative_frames);
+            (part(GroundPart::Train)?, part(GroundPart::Selection)?)
         } else {
-            given.hold_out(&self.holdout(seed))?
+            given.hold_out(&self.holdout(method.seed, &rule))?
         };
-        let rule = self.rule();
         let training = training.triplets(&rule).context("nothing to learn from")?;
         let validation = validation
             .triplets(&rule)
@@ -121,17 +136,20 @@ impl TrainData {
     }
 
     /// Which images count as positives and negatives, for a report.
-    pub(super) fn distances(&self) -> String {
-        let Self {
-            positive_m,
-            negative_m,
+    pub(super) fn distances(&self, recipe: Recipe) -> String {
+        let TripletRule {
+            reach,
             positive_frames,
             negative_frames,
-            ..
-        } = self;
+        } = self.rule(recipe);
+        let degrees = match reach.degrees {
+            Some(degrees) => format!(" and {degrees} degrees"),
+            None => String::new(),
+        };
         format!(
-            "positives within {positive_m} m or {positive_frames} frames, negatives beyond \
-             {negative_m} m or {negative_frames} frames"
+            "positives within {} m{degrees} or {positive_frames} frames, negatives beyond {} m or \
+             {negative_frames} frames",
+            reach.positive, reach.negative
         )
     }
 
@@ -151,20 +169,24 @@ impl TrainData {
         )
     }
 
-    fn holdout(&self, seed: u64) -> Holdout {
+    fn holdout(&self, seed: u64, rule: &TripletRule) -> Holdout {
         Holdout {
             share: self.validation_share,
             block_m: self.validation_block,
-            gap_m: self.negative_m,
-            gap_frames: self.negative_frames,
+            gap_m: rule.reach.negative,
+            gap_frames: rule.negative_frames,
             seed,
         }
     }
 
-    fn rule(&self) -> TripletRule {
+    fn rule(&self, recipe: Recipe) -> TripletRule {
+        let degrees = recipe.pick(None, Some(40.0));
         TripletRule {
-            positive_m: self.positive_m,
-            negative_m: self.negative_m,
+            reach: Reach {
+                positive: self.positive_metres.unwrap_or(recipe.pick(10.0, 15.0)),
+                degrees: self.positive_degrees.or(degrees),
+                negative: self.negative_metres.unwrap_or(recipe.pick(25.0, 40.0)),
+            },
             positive_frames: self.positive_frames,
             negative_frames: self.negative_frames,
         }
@@ -210,11 +232,13 @@ mod tests {
     struct Command {
         #[command(flatten)]
         data: TrainData,
+        #[command(flatten)]
+        method: MethodArgs,
     }
 
     fn load(arguments: &[&str]) -> anyhow::Result<Sides> {
         let command = Command::try_parse_from([&["train"], arguments].concat())?;
-        command.data.load(1)
+        command.data.load(&command.method)
     }
 
     /// Cities of three places each, as MSLS is distributed; no city of training has a subtask

@@ -1,11 +1,11 @@
 //! Training the head alone, on pooled tokens.
 
-use super::{HeadTrainArgs, RunArgs, facts, finish, notes};
-use crate::cli::output::note;
+use super::{HeadTrainArgs, RunArgs, cache_folder, facts, finish, notes, write_settings};
+use crate::cli::output::{note, say};
 use crate::cli::progress::ProgressBars;
 use anyhow::Context;
 use placeformer_lab::train::{
-    Augmentation, HeadModel, PooledCache, PooledTokens, Session, SetTokens, starting_head,
+    HeadModel, PooledCache, PooledTokens, Session, SetTokens, starting_head,
 };
 use placeformer_models::open_extractor;
 use placeformer_vision::extract::{Extractor, HeadChoice};
@@ -17,8 +17,8 @@ pub(in crate::cli) fn train_head(args: HeadTrainArgs) -> anyhow::Result<()> {
 
 pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
     placeformer_kernels::self_check()?;
-    let config = args.config(Augmentation::NONE)?;
-    let sides = args.data.load(args.method.seed)?;
+    let config = args.method.head_config()?;
+    let sides = args.data.load(&args.method)?;
     note!("{}", sides.description);
     let extract = args.model.extract_config()?;
     let progress = ProgressBars::default();
@@ -47,6 +47,12 @@ pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
         &sides.validation.fingerprint(),
     ]
     .join(" ");
+    let began = match extract.head {
+        HeadChoice::None => "a partly whitened PCA of the training images".to_owned(),
+        other => format!("head {other} ({})", start.aggregate()),
+    };
+    let facts = facts(args, "head", &sides.description, &began);
+    write_settings(&args.out, &facts, &config)?;
     let session = Session {
         folder: args.out.clone(),
         identity,
@@ -54,30 +60,18 @@ pub(super) fn train(args: &RunArgs) -> anyhow::Result<()> {
     };
     let outcome = model.train(&sides.training, &sides.validation, &config, session)?;
     let (weight, bias) = model.weights()?;
-    let notes = notes(
-        args,
-        &extractor.input_size().to_string(),
-        &sides.description,
-        &outcome,
-    );
-    start
-        .with_weights(weight, bias, notes)?
-        .save(&args.out.join("head.safetensors"))?;
-    let began = match extract.head {
-        HeadChoice::None => "a half-whitened PCA of the training images".to_owned(),
-        other => format!("head {other} ({})", start.aggregate()),
-    };
-    finish(
-        &args.out,
-        &facts(args, "head", &sides.description, &began),
-        &config,
-        &outcome,
-    )
+    let size = extractor.input_size().to_string();
+    let notes = notes(&config, &size, &sides.description, &outcome);
+    let path = args.out.join("head.safetensors");
+    start.with_weights(weight, bias, notes)?.save(&path)?;
+    finish(&args.out, &facts, &config, &outcome)?;
+    say!("{}", path.display())?;
+    Ok(())
 }
 
 /// The cache of pooled tokens that `extractor` makes.
 pub(super) fn open_cache(args: &RunArgs, extractor: &Extractor) -> anyhow::Result<PooledCache> {
-    let folder = args.cache_folder()?;
+    let folder = cache_folder(args.cache.as_ref(), "pooled")?;
     PooledCache::open(&folder, extractor).with_context(|| folder.display().to_string())
 }
 

@@ -9,10 +9,12 @@
 //! | `dataset`, `pose` | what every reader answers with |
 //! | `kind`, `options` | which data set to read, and how |
 //! | `msls`, `nordland`, `pairs`, `robotcar`, `utm` | the readers |
+//! | `ground` | parts that share no place |
 //! | `layout`, `table`, `positions`, `zones`, `neighbours` | what several readers need |
 
 mod dataset;
 mod error;
+mod ground;
 mod kind;
 mod layout;
 mod msls;
@@ -29,8 +31,9 @@ mod zones;
 
 pub use dataset::{Dataset, Item, Skipped, Truth};
 pub use error::DatasetError;
+pub use ground::{GroundPart, GroundSplit};
 pub use kind::{DatasetKind, Split};
-pub use neighbours::NeighbourGrid;
+pub use neighbours::{NeighbourGrid, angle_between};
 pub use options::DatasetOptions;
 pub use pairs::load_pairs;
 pub use pose::Pose;

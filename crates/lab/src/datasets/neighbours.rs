@@ -51,7 +51,7 @@ fn cell(point: MetricPoint, width: f64) -> (i64, i64) {
 }
 
 /// Smallest difference of two directions, 0 to 180 degrees.
-pub(super) fn angle_between(a: f64, b: f64) -> f64 {
+pub fn angle_between(a: f64, b: f64) -> f64 {
     let difference = (a - b).rem_euclid(360.0);
     difference.min(360.0 - difference)
 }

@@ -1,27 +1,33 @@
-//! Training the transformer itself, wholly or its last blocks, together with the head.
+//! Training the transformer itself, wholly or its last blocks, together with the head and its
+//! aggregate.
 //!
-//! The same computation as [`CandleEncoder`](placeformer_vision::extract::CandleEncoder), built of
-//! differentiable operations only and over whole batches; a test compares the two. Layers that are
-//! not trained are plain tensors, so that no graph is recorded through them.
+//! Layers that are not trained are plain tensors, so that no graph is recorded through them. The
+//! blocks before the first trained one need not be computed at all where their tokens are cached
+//! (`token_cache`).
 
 use super::augment::{Augmentation, augment};
-use super::config::TrainConfig;
+use super::averaged::Averaged;
+use super::config::{Finish, TrainConfig};
 use super::error::TrainError;
-use super::loss::normalise_rows;
-use super::model::{Sample, TripletModel};
+use super::model::{Graph, Group, Sample, TripletModel, Variable};
+use super::pooling::{self, Pooling};
+use super::token_cache::TokenCache;
 use super::trainer::{Outcome, Session, run};
+use super::transformer::{MATRICES, Pass, Transformer};
 use super::triplets::TripletSet;
-use candle_core::{D, Device, Tensor, Var};
-use placeformer_core::types::{GLOBAL_DIM, ImageTensor};
-use placeformer_vision::extract::{
-    Aggregate, EncoderSpec, Head, LAYER_NORM_EPS, VitWeights, interpolate_positions,
-};
+use super::weights::{DOWN, UP, Weights};
+use candle_core::Tensor;
+use placeformer_core::progress::Progress;
+use placeformer_core::types::ImageTensor;
+use placeformer_vision::extract::{Difference, EncoderSpec, Factors, Head, VitWeights};
 use placeformer_vision::image::{ImageConfig, load_tensor};
 use rayon::prelude::*;
-use std::collections::{BTreeMap, HashMap};
-use std::path::Path;
+use std::collections::BTreeMap;
 
 type Result<T> = std::result::Result<T, TrainError>;
+
+/// Images that are embedded together outside of a graph, on each thread.
+pub(super) const EMBED_BATCH: usize = 8;
 
 /// Which weights move besides the head.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -32,94 +38,113 @@ pub enum TrainableBlocks {
     All,
 }
 
+impl TrainableBlocks {
+    /// The first trained block of `computed` ones; 0 also where what comes before it is trained.
+    ///
+    /// # Errors
+    /// More blocks than are computed, or none.
+    pub fn first_of(self, computed: usize) -> Result<usize> {
+        match self {
+            Self::Last(count) if (1..=computed).contains(&count) => Ok(computed - count),
+            Self::Last(count) => Err(TrainError::Setting(format!(
+                "{count} of {computed} computed blocks cannot be trained"
+            ))),
+            Self::All => Ok(0),
+        }
+    }
+}
+
+/// What moves, and how.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Trainable {
+    /// Which blocks.
+    pub blocks: TrainableBlocks,
+    /// Rank of the adapters that are trained in the place of the blocks' matrices; all else of the
+    /// blocks stays then. `None` trains the blocks themselves.
+    pub rank: Option<usize>,
+    /// Decides how adapters start.
+    pub seed: u64,
+}
+
+/// Where the tokens before the first trained block come from.
+pub enum TokenSource {
+    /// Every image passes the whole transformer at every step, varied anew each time.
+    Images {
+        /// Limits on images.
+        limits: ImageConfig,
+        /// How they vary.
+        augmentation: Augmentation,
+    },
+    /// From a cache that holds every image of the sets.
+    Cached(Box<TokenCache>),
+}
+
 /// A differentiable transformer with its head.
 pub struct BackboneModel {
     base: VitWeights,
     spec: EncoderSpec,
-    /// Every tensor of the computed part by its fused name.
-    tensors: HashMap<String, Tensor>,
-    /// Those that are trained, with the head's two.
-    variables: BTreeMap<String, Var>,
-    /// Interpolation of the learned positions to this input's grid, `[1 + n, 1 + table]`.
-    interpolation: Tensor,
-    images: ImageConfig,
-    augmentation: Augmentation,
-}
-
-const HEAD_WEIGHT: &str = "head.weight";
-const HEAD_BIAS: &str = "head.bias";
-
-impl TrainableBlocks {
-    /// Refuses more blocks than are computed, and none.
-    fn check(self, computed: usize) -> Result<()> {
-        match self {
-            Self::Last(count) if !(1..=computed).contains(&count) => Err(TrainError::Setting(
-                format!("{count} of {computed} computed blocks cannot be trained"),
-            )),
-            Self::Last(_) | Self::All => Ok(()),
-        }
-    }
+    transformer: Transformer,
+    pub(super) pooling: Pooling,
+    pub(super) weights: Weights,
+    /// The trained weights before the first step.
+    pub(super) start: BTreeMap<String, Tensor>,
+    /// First trained block; 0 where what comes before the blocks is trained too.
+    first: usize,
+    source: TokenSource,
+    pub(super) finish: Finish,
 }
 
 impl BackboneModel {
-    /// Starts from pre-trained weights and a head of `weight` `[256, dim]` and `bias` `[256]`.
+    /// Starts from pre-trained weights and a head. `finish` says what is made of the trained
+    /// weights.
     ///
     /// # Errors
-    /// More blocks are to be trained than are computed, or a tensor has another shape than the
-    /// model.
+    /// More blocks are to be trained than are computed, the head pools in a way that cannot be
+    /// trained, or a tensor has another shape than the model.
     pub fn new(
         base: VitWeights,
         spec: EncoderSpec,
-        head: (&[f32], &[f32]),
-        trainable: TrainableBlocks,
-        images: ImageConfig,
-        augmentation: Augmentation,
+        head: &Head,
+        trainable: Trainable,
+        source: TokenSource,
+        finish: Finish,
     ) -> Result<Self> {
         let blocks = spec.exit_block + 1;
-        trainable.check(blocks)?;
-        let mut tensors = HashMap::new();
-        let mut variables = BTreeMap::new();
-        for (name, shape, values) in base.tensors() {
+        let first = trainable.blocks.first_of(blocks)?;
+        let mut weights = Weights::default();
+        for (number, (name, shape, values)) in base.tensors().into_iter().enumerate() {
             if block_of(&name).is_some_and(|block| block >= blocks) {
                 continue;
             }
-            let tensor = Tensor::from_slice(values, shape, &Device::Cpu)?;
-            if is_trained(&name, trainable, blocks, spec.token_norm) {
-                let variable = Var::from_tensor(&tensor)?;
-                tensors.insert(name.clone(), variable.as_tensor().clone());
-                variables.insert(name, variable);
-            } else {
-                tensors.insert(name, tensor);
+            let moves = is_trained(&name, trainable.blocks, first, spec.token_norm);
+            match trainable.rank {
+                None if moves => weights.train(&name, &shape, values)?,
+                Some(rank) if moves && is_matrix(&name) => {
+                    let seed = trainable.seed.wrapping_add(number as u64);
+                    weights.adapt(&name, &shape, values, rank, seed)?;
+                }
+                _ => weights.fix(&name, &shape, values)?,
             }
         }
-        let (weight, bias) = head;
-        let of_head = [
-            (HEAD_WEIGHT, weight, vec![GLOBAL_DIM, base.geometry.dim]),
-            (HEAD_BIAS, bias, vec![GLOBAL_DIM]),
-        ];
-        for (name, values, shape) in of_head {
-            let variable = Var::from_tensor(&Tensor::from_slice(values, shape, &Device::Cpu)?)?;
-            tensors.insert(name.into(), variable.as_tensor().clone());
-            variables.insert(name.into(), variable);
-        }
-        let interpolation = interpolation_matrix(&base, &spec)?;
+        let pooling = Pooling::of(head, &mut weights)?;
         Ok(Self {
+            transformer: Transformer::new(&base, spec)?,
+            start: weights.snapshot()?,
             base,
             spec,
-            tensors,
-            variables,
-            interpolation,
-            images,
-            augmentation,
+            pooling,
+            weights,
+            first,
+            source,
+            finish,
         })
     }
 
-    /// Trains in place; afterwards the weights are the best seen.
+    /// Trains in place; afterwards the weights are the best seen, before anything is made of them.
     ///
     /// # Errors
     /// A setting is out of range, the checkpoint is one of another run, an image cannot be read, or
-    /// the
-    /// loss is no longer finite.
+    /// the loss is no longer finite.
     pub fn train(
         &self,
         training: &TripletSet,
@@ -130,219 +155,165 @@ impl BackboneModel {
         run(self, training, validation, config, session)
     }
 
-    /// Writes the backbone to `weights` and the head, bound to `backbone`, to `head`.
-    ///
-    /// The backbone's identity follows from its weights, so `backbone` is asked for only once these
-    /// are written.
-    ///
-    /// # Errors
-    /// A file cannot be written, or `backbone` fails.
-    pub fn save(
-        &self,
-        weights: &Path,
-        head: &Path,
-        backbone: impl FnOnce() -> Result<String>,
-        notes: BTreeMap<String, String>,
-    ) -> Result<()> {
-        let mut trained = self.base.clone();
-        for (name, variable) in &self.variables {
-            if name != HEAD_WEIGHT && name != HEAD_BIAS {
-                let values = variable.flatten_all()?.to_vec1::<f32>()?;
-                if !trained.replace(name, &values) {
-                    return Err(TrainError::Tensor(format!(
-                        "the backbone has no tensor {name} of this shape"
-                    )));
-                }
-            }
-        }
-        trained.save(weights)?;
-        let flat =
-            |name: &str| Ok::<_, TrainError>(self.tensor(name)?.flatten_all()?.to_vec1::<f32>()?);
-        Ok(Head::new(
-            Aggregate::Mean,
-            flat(HEAD_WEIGHT)?,
-            flat(HEAD_BIAS)?,
-            backbone()?,
-            notes,
-        )?
-        .save(head)?)
+    /// Number of values that training moves.
+    pub fn trained_values(&self) -> usize {
+        let variables = self.weights.variables().values();
+        variables.map(|variable| variable.elem_count()).sum()
     }
 
-    fn tensor(&self, name: &str) -> Result<&Tensor> {
-        self.tensors
-            .get(name)
-            .ok_or_else(|| TrainError::Tensor(format!("the backbone has no tensor {name}")))
+    /// The backbone that comes out: what was trained, averaged with the start.
+    ///
+    /// # Errors
+    /// The tensor library fails.
+    pub fn backbone(&self) -> Result<VitWeights> {
+        let averaged = self.weights.averaged(&self.start, self.finish.average)?;
+        let mut trained = self.base.clone();
+        for (name, _, _) in self.base.tensors() {
+            if averaged.moves(&name) && !trained.replace(&name, &averaged.values(&name)?) {
+                return Err(TrainError::Tensor(format!(
+                    "the backbone has no tensor {name} of this shape"
+                )));
+            }
+        }
+        Ok(trained)
+    }
+
+    /// The backbone that comes out as a difference to `stock`, which is what training started from
+    /// or what that was made of.
+    ///
+    /// # Errors
+    /// Nothing was learnt, or `stock` has other tensors.
+    pub fn difference(
+        &self,
+        stock: &VitWeights,
+        notes: BTreeMap<String, String>,
+    ) -> Result<Difference> {
+        let averaged = self.weights.averaged(&self.start, self.finish.average)?;
+        let mut factors = BTreeMap::new();
+        for (name, up) in averaged.variables() {
+            let Some(target) = name.strip_suffix(UP) else {
+                continue;
+            };
+            let rank = up.dim(1)?;
+            let up = averaged.values(name)?;
+            let down = averaged.values(&format!("{target}{DOWN}"))?;
+            factors.insert(target.to_owned(), Factors { rank, up, down });
+        }
+        if factors.is_empty() || stock.content_hash() != self.base.content_hash() {
+            return Ok(Difference::between(stock, &self.backbone()?, notes)?);
+        }
+        Ok(Difference::of_factors(stock, factors, notes)?)
+    }
+
+    /// The head that comes out for `backbone`: averaged with the start like it, and not fitted
+    /// again.
+    ///
+    /// # Errors
+    /// Its values can no longer be computed with.
+    pub fn head(&self, backbone: String, notes: BTreeMap<String, String>) -> Result<Head> {
+        let averaged = self.weights.averaged(&self.start, self.finish.average)?;
+        self.pooling.head(&averaged, backbone, notes)
     }
 
     /// Patch tokens of the exit block, `[batch, n, dim]`.
-    fn tokens(&self, images: &[ImageTensor]) -> Result<Tensor> {
-        let geometry = &self.base.geometry;
-        let dim = geometry.dim;
-        let patch = geometry.patch;
-        let patches: Vec<Tensor> = images
-            .iter()
-            .map(|image| unfold(image, patch))
-            .collect::<Result<_>>()?;
-        let kernel = self
-            .tensor("patch_embed.proj.weight")?
-            .reshape((dim, 3 * patch * patch))?;
-        let patches = linear(
-            &Tensor::stack(&patches, 0)?,
-            &kernel,
-            self.tensor("patch_embed.proj.bias")?,
-        )?;
-        let cls = self
-            .tensor("cls_token")?
-            .reshape((1, 1, dim))?
-            .broadcast_as((images.len(), 1, dim))?;
-        let table = self.tensor("pos_embed")?;
-        let table = table.reshape((table.elem_count() / dim, dim))?;
-        let positions = self.interpolation.matmul(&table)?;
-        let mut x = Tensor::cat(&[&cls.contiguous()?, &patches], 1)?.broadcast_add(&positions)?;
-        for block in 0..=self.spec.exit_block {
-            x = self.block(&x, block)?;
-        }
-        if self.spec.token_norm {
-            x = self.norm(&x, "norm")?;
-        }
-        Ok(x.narrow(1, 1, x.dim(1)? - 1)?)
+    fn tokens(&self, pass: Pass<'_>, images: &[ImageTensor]) -> Result<Tensor> {
+        let embedded = self.transformer.embed_patches(pass, images)?;
+        self.transformer.run(pass, embedded, 0)
     }
 
-    fn block(&self, x: &Tensor, block: usize) -> Result<Tensor> {
-        let (batch, length, dim) = x.dims3()?;
-        let heads = self.base.geometry.heads;
-        let head_dim = self.base.geometry.head_dim();
-        let name = |part: &str| format!("blocks.{block}.{part}");
-        let fused = self.dense(&self.norm(x, &name("norm1"))?, &name("attn.qkv"))?;
-        let part = |index: usize| -> candle_core::Result<Tensor> {
-            let part = fused.narrow(D::Minus1, index * dim, dim)?;
-            part.reshape((batch, length, heads, head_dim))?
-                .transpose(1, 2)?
-                .contiguous()
+    /// Pooled tokens of unit length, `[samples, pooled]`, under the weights of `pass`.
+    pub(super) fn pooled(
+        &self,
+        pass: Pass<'_>,
+        set: &TripletSet,
+        samples: &[Sample],
+    ) -> Result<Tensor> {
+        let tokens = match &self.source {
+            TokenSource::Cached(cache) => {
+                let before = cache.tokens(set, samples)?;
+                self.transformer.run(pass, before, self.first)?
+            }
+            TokenSource::Images {
+                limits,
+                augmentation,
+            } => {
+                let images: Vec<ImageTensor> = samples
+                    .par_iter()
+                    .map(|sample| self.load(set, sample, limits, augmentation))
+                    .collect::<Result<_>>()?;
+                self.tokens(pass, &images)?
+            }
         };
-        let queries = (part(0)? * (head_dim as f64).powf(-0.5))?;
-        let scores = queries.matmul(&part(1)?.transpose(2, 3)?.contiguous()?)?;
-        let mixed = candle_nn::ops::softmax(&scores, D::Minus1)?.matmul(&part(2)?)?;
-        let mixed = mixed.transpose(1, 2)?.reshape((batch, length, dim))?;
-        let x = self.residual(
-            x,
-            self.dense(&mixed, &name("attn.proj"))?,
-            &name("ls1.gamma"),
-        )?;
-        let hidden = self
-            .dense(&self.norm(&x, &name("norm2"))?, &name("mlp.fc1"))?
-            .gelu_erf()?;
-        self.residual(
-            &x,
-            self.dense(&hidden, &name("mlp.fc2"))?,
-            &name("ls2.gamma"),
-        )
+        self.pooling.pool(pass, &tokens)
     }
 
-    fn residual(&self, x: &Tensor, branch: Tensor, scale: &str) -> Result<Tensor> {
-        Ok(match self.tensors.get(scale) {
-            Some(scale) => (x + branch.broadcast_mul(scale)?)?,
-            None => (x + branch)?,
-        })
+    /// Descriptors of unit length, `[samples, 256]`, under the weights of `pass`.
+    pub(super) fn described(
+        &self,
+        pass: Pass<'_>,
+        set: &TripletSet,
+        samples: &[Sample],
+    ) -> Result<Tensor> {
+        pooling::project(pass, &self.pooled(pass, set, samples)?)
     }
 
-    fn dense(&self, x: &Tensor, layer: &str) -> Result<Tensor> {
-        linear(
-            x,
-            self.tensor(&format!("{layer}.weight"))?,
-            self.tensor(&format!("{layer}.bias"))?,
-        )
-    }
-
-    fn norm(&self, x: &Tensor, layer: &str) -> Result<Tensor> {
-        let weight = self.tensor(&format!("{layer}.weight"))?;
-        let bias = self.tensor(&format!("{layer}.bias"))?;
-        // The fused LayerNorm of candle has no gradient.
-        Ok(candle_nn::ops::layer_norm_slow(
-            x,
-            weight,
-            bias,
-            LAYER_NORM_EPS,
-        )?)
-    }
-
-    fn load(&self, set: &TripletSet, sample: &Sample) -> Result<ImageTensor> {
+    fn load(
+        &self,
+        set: &TripletSet,
+        sample: &Sample,
+        limits: &ImageConfig,
+        augmentation: &Augmentation,
+    ) -> Result<ImageTensor> {
         let path = &set.images(sample.side)[sample.index];
         let bytes = std::fs::read(path).map_err(|source| TrainError::Io {
             path: path.clone(),
             source,
         })?;
-        let image = load_tensor(&bytes, &self.images, self.spec.input_size)
+        let image = load_tensor(&bytes, limits, self.spec.input_size)
             .map_err(|error| TrainError::Setting(format!("{}: {error}", path.display())))?;
         Ok(match sample.variation {
-            Some(seed) => augment(&image, &self.augmentation, seed),
+            Some(seed) => augment(&image, augmentation, seed),
             None => image,
         })
     }
 }
 
 impl TripletModel for BackboneModel {
-    fn variables(&self) -> Vec<(String, Var)> {
-        self.variables
-            .iter()
-            .map(|(name, variable)| (name.clone(), variable.clone()))
-            .collect()
+    fn variables(&self) -> Vec<Variable> {
+        let variable = |(name, variable): (&String, &candle_core::Var)| Variable {
+            name: name.clone(),
+            variable: variable.clone(),
+            group: group_of(name),
+        };
+        self.weights.variables().iter().map(variable).collect()
     }
 
-    fn embed(&self, set: &TripletSet, samples: &[Sample]) -> Result<Tensor> {
-        let images: Vec<ImageTensor> = samples
-            .par_iter()
-            .map(|sample| self.load(set, sample))
-            .collect::<Result<_>>()?;
-        let pooled = normalise_rows(&self.tokens(&images)?.mean(1)?)?;
-        let projected = linear(&pooled, self.tensor(HEAD_WEIGHT)?, self.tensor(HEAD_BIAS)?)?;
-        Ok(normalise_rows(&projected)?)
+    fn embed(&self, set: &TripletSet, samples: &[Sample], graph: Graph) -> Result<Tensor> {
+        let pass = Pass {
+            weights: &self.weights,
+            graph,
+        };
+        self.described(pass, set, samples)
     }
 
     fn embed_batch(&self) -> usize {
-        8
+        EMBED_BATCH
     }
-}
 
-/// x W^T + b over the last dimension.
-fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
-    let mut shape = x.dims().to_vec();
-    let input = shape.pop().unwrap_or_default();
-    let rows = x.reshape((x.elem_count() / input.max(1), input))?;
-    shape.push(bias.elem_count());
-    Ok(rows
-        .matmul(&weight.t()?)?
-        .broadcast_add(bias)?
-        .reshape(shape)?)
-}
-
-/// Patches in row-major order, each as channel, row, column: `[n, 3 p p]`.
-fn unfold(image: &ImageTensor, patch: usize) -> Result<Tensor> {
-    let width = image.size.width as usize;
-    let height = image.size.height as usize;
-    let columns = width / patch;
-    let rows = height / patch;
-    let planes = Tensor::from_slice(&image.data, (3, rows, patch, columns, patch), &Device::Cpu)?;
-    Ok(planes
-        .permute((1, 3, 0, 2, 4))?
-        .reshape((rows * columns, 3 * patch * patch))?)
-}
-
-/// Interpolation of positions is linear in the table: interpolating unit vectors gives its matrix,
-/// through which gradients can flow.
-fn interpolation_matrix(base: &VitWeights, spec: &EncoderSpec) -> Result<Tensor> {
-    let (columns, rows) = base.geometry.grid(spec.input_size);
-    let entries = 1 + base.position_grid.0 * base.position_grid.1;
-    let mut unit = vec![0.0f32; entries * entries];
-    unit.iter_mut()
-        .step_by(entries + 1)
-        .for_each(|value| *value = 1.0);
-    let matrix = interpolate_positions(&unit, entries, base.position_grid, (rows, columns));
-    Ok(Tensor::from_vec(
-        matrix,
-        (1 + rows * columns, entries),
-        &Device::Cpu,
-    )?)
+    fn outcome(
+        &self,
+        training: &TripletSet,
+        progress: &dyn Progress,
+    ) -> Result<Option<Box<dyn TripletModel + '_>>> {
+        if !self.finish.changes() {
+            return Ok(None);
+        }
+        let averaged = Averaged::of(self)?;
+        if let Some(power) = self.finish.whitening {
+            averaged.fit(training, power, progress)?;
+        }
+        Ok(Some(Box::new(averaged)))
+    }
 }
 
 fn block_of(name: &str) -> Option<usize> {
@@ -353,12 +324,25 @@ fn block_of(name: &str) -> Option<usize> {
         .ok()
 }
 
-fn is_trained(name: &str, trainable: TrainableBlocks, blocks: usize, token_norm: bool) -> bool {
-    match (trainable, block_of(name)) {
-        (TrainableBlocks::Last(count), Some(block)) => block + count >= blocks,
-        (TrainableBlocks::Last(_), None) => name.starts_with("norm.") && token_norm,
-        (TrainableBlocks::All, None) if name.starts_with("norm.") => token_norm,
+fn is_trained(name: &str, blocks: TrainableBlocks, first: usize, token_norm: bool) -> bool {
+    match (blocks, block_of(name)) {
+        (_, None) if name.starts_with("norm.") => token_norm,
+        (TrainableBlocks::Last(_), block) => block.is_some_and(|block| block >= first),
         (TrainableBlocks::All, _) => true,
+    }
+}
+
+/// Whether an adapter can be added to the tensor.
+fn is_matrix(name: &str) -> bool {
+    let layer = name.strip_suffix(".weight");
+    layer.is_some_and(|layer| MATRICES.iter().any(|matrix| layer.ends_with(matrix)))
+}
+
+fn group_of(name: &str) -> Group {
+    match name {
+        pooling::WEIGHT | pooling::BIAS => Group::Projection,
+        name if name.starts_with(pooling::AGGREGATE) => Group::Aggregate,
+        _ => Group::Blocks,
     }
 }
 

@@ -23,6 +23,7 @@ pub(super) struct Checkpoint {
     pub(super) cycles_without_gain: u32,
     pub(super) initial: ValidationRecall,
     pub(super) best: ValidationRecall,
+    pub(super) last: ValidationRecall,
     pub(super) last_loss: f32,
     best_weights: HashMap<String, Tensor>,
 }
@@ -34,6 +35,7 @@ struct State {
     cycles_without_gain: u32,
     initial: ValidationRecall,
     best: ValidationRecall,
+    last: ValidationRecall,
     last_loss: f32,
     config: TrainConfig,
     identity: String,
@@ -93,6 +95,7 @@ impl Checkpoint {
             cycles_without_gain: 0,
             initial,
             best: initial,
+            last: initial,
             last_loss: 0.0,
             best_weights,
         })
@@ -107,6 +110,7 @@ impl Checkpoint {
         recall: ValidationRecall,
     ) -> Result<(), TrainError> {
         self.steps = steps;
+        self.last = recall;
         self.last_loss = loss;
         if recall.criterion() > self.best.criterion() {
             self.best = recall;
@@ -165,6 +169,7 @@ impl Checkpoint {
             cycles_without_gain: state.cycles_without_gain,
             initial: state.initial,
             best: state.best,
+            last: state.last,
             last_loss: state.last_loss,
             best_weights,
         }))
@@ -193,6 +198,7 @@ impl Checkpoint {
             cycles_without_gain: self.cycles_without_gain,
             initial: self.initial,
             best: self.best,
+            last: self.last,
             last_loss: self.last_loss,
             config: config.clone(),
             identity: identity.to_owned(),

@@ -4,9 +4,11 @@ use super::adam::Adam;
 use super::config::TrainConfig;
 use super::embed::{Embeddings, embed};
 use super::error::TrainError;
-use super::loss::triplet_margin_loss;
+use super::gradients::{LossOf, gradients};
+use super::loss::{Loss, Pairs, info_nce, multi_similarity, triplet_margin_loss};
 use super::mining::{draw_pool, hardest_negatives};
 use super::model::{Sample, TripletModel};
+use super::pairs::PairMiner;
 use super::triplets::{Side, TripletSet};
 use placeformer_core::progress::{Progress, Task};
 use placeformer_vision::extract::squared_distance;
@@ -14,6 +16,7 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::{BTreeSet, HashMap};
 use std::ops::Range;
+use std::time::Instant;
 
 /// What a cycle works on, and whom it tells.
 pub(super) struct Cycle<'a> {
@@ -35,14 +38,6 @@ pub(super) struct Draw {
     variations: [u64; 3],
 }
 
-/// The images of a batch by their role: entries of one index form a triplet.
-#[derive(Default)]
-struct Batch {
-    queries: Vec<Sample>,
-    positives: Vec<Sample>,
-    negatives: Vec<Sample>,
-}
-
 /// What a mining found.
 struct Mined {
     embeddings: Embeddings,
@@ -50,32 +45,67 @@ struct Mined {
     negatives: HashMap<u32, Vec<u32>>,
 }
 
+/// How the steps of a cycle went.
+pub(super) struct Steps {
+    /// Mean loss.
+    pub(super) loss: f32,
+    /// Mean seconds of a step.
+    pub(super) seconds: f64,
+}
+
 impl Cycle<'_> {
-    /// Mines once, then takes the steps of `range`; returns their mean loss.
+    /// Mines once, then takes the steps of `range`; returns how they went.
     pub(super) fn run(
         &self,
         usable: &[usize],
         adam: &mut Adam,
         range: Range<u64>,
-    ) -> Result<f32, TrainError> {
+    ) -> Result<Steps, TrainError> {
+        let batches = match self.config.loss {
+            Loss::Triplet { .. } => self.triplets(usable, range.clone())?,
+            Loss::InfoNce { .. } | Loss::MultiSimilarity => {
+                let miner = PairMiner {
+                    model: self.model,
+                    set: self.set,
+                    config: self.config,
+                    progress: self.progress,
+                };
+                miner.batches(usable, range.clone())?
+            }
+        };
+        let count = range.end - range.start;
+        let mut total = 0.0;
+        let started = Instant::now();
+        for (step, samples) in range.zip(&batches) {
+            let loss = self.step(samples, adam, step)?;
+            total += loss;
+            self.steps.set_note(format!("loss {loss:.4}"));
+            self.steps.set_done(step + 1);
+        }
+        Ok(Steps {
+            loss: total / count as f32,
+            seconds: started.elapsed().as_secs_f64() / count as f64,
+        })
+    }
+
+    /// The images of the triplets of every step: all queries, then their positives, then their
+    /// negatives.
+    fn triplets(
+        &self,
+        usable: &[usize],
+        range: Range<u64>,
+    ) -> Result<Vec<Vec<Sample>>, TrainError> {
         let pool = draw_pool(
             self.set.database.len(),
             self.config.mining_pool,
             self.config.seed ^ range.start.rotate_left(32),
         );
-        let draws = self.draw(usable, &pool, range.clone())?;
+        let draws = self.draw(usable, &pool, range)?;
         let mined = self.mine(&draws, &pool)?;
-
-        let count = range.end - range.start;
-        let mut total = 0.0;
-        for (step, draws) in range.zip(&draws) {
-            let batch = self.batch(draws, &mined)?;
-            let loss = self.step(batch, adam, step)?;
-            total += loss;
-            self.steps.set_note(format!("loss {loss:.4}"));
-            self.steps.set_done(step + 1);
-        }
-        Ok(total / count as f32)
+        draws
+            .iter()
+            .map(|draws| self.batch(draws, &mined))
+            .collect()
     }
 
     /// The triplets of every step of `range`, drawn at random from the queries that have a negative
@@ -141,8 +171,10 @@ impl Cycle<'_> {
     /// Chooses the other two images of each triplet: of the query's positives the one that looks
     /// most like it now, because a positive may have been taken in another direction; and one of
     /// its hard negatives at random.
-    fn batch(&self, draws: &[Draw], mined: &Mined) -> Result<Batch, TrainError> {
-        let mut batch = Batch::default();
+    fn batch(&self, draws: &[Draw], mined: &Mined) -> Result<Vec<Sample>, TrainError> {
+        let mut queries = Vec::new();
+        let mut positives = Vec::new();
+        let mut negatives = Vec::new();
         for draw in draws {
             let (Some(positive), Some(negative)) = (
                 self.nearest_positive(draw.query, &mined.embeddings)?,
@@ -154,14 +186,11 @@ impl Cycle<'_> {
                 )));
             };
             let [of_query, of_positive, of_negative] = draw.variations;
-            let query = self.sample(Side::Query, draw.query, of_query);
-            batch.queries.push(query);
-            let positive = self.sample(Side::Database, positive, of_positive);
-            batch.positives.push(positive);
-            let negative = self.sample(Side::Database, negative, of_negative);
-            batch.negatives.push(negative);
+            queries.push(self.sample(Side::Query, draw.query, of_query));
+            positives.push(self.sample(Side::Database, positive, of_positive));
+            negatives.push(self.sample(Side::Database, negative, of_negative));
         }
-        Ok(batch)
+        Ok([queries, positives, negatives].concat())
     }
 
     fn nearest_positive(
@@ -189,21 +218,48 @@ impl Cycle<'_> {
     }
 
     /// Takes one step of the optimiser; returns the loss before it.
-    fn step(&self, batch: Batch, adam: &mut Adam, step: u64) -> Result<f32, TrainError> {
-        let count = batch.queries.len();
-        // All three roles are embedded in one pass: the larger the batch, the faster the backbone.
-        let samples: Vec<Sample> = [batch.queries, batch.positives, batch.negatives].concat();
-        let descriptors = self.model.embed(self.set, &samples)?;
-        let queries = descriptors.narrow(0, 0, count)?;
-        let positives = descriptors.narrow(0, count, count)?;
-        let negatives = descriptors.narrow(0, 2 * count, count)?;
-        let loss = triplet_margin_loss(&queries, &positives, &negatives, self.config.margin)?;
-        let value = loss.to_scalar::<f32>()?;
+    fn step(&self, samples: &[Sample], adam: &mut Adam, step: u64) -> Result<f32, TrainError> {
+        let config = self.config;
+        let loss = self.loss_of(samples)?;
+        let at_once = config.images_at_once.unwrap_or(samples.len());
+        let (value, mut gradients) =
+            gradients(self.model, self.set, samples, at_once, loss.as_ref())?;
         if !value.is_finite() {
             return Err(TrainError::Diverged { step, loss: value });
         }
-        adam.step(&loss.backward()?, self.config.schedule.rate(step))?;
+        if let Some(longest) = config.longest_gradient {
+            gradients.clip(longest)?;
+        }
+        adam.step(&gradients, |group| config.rate(group, step))?;
         Ok(value)
+    }
+
+    /// The loss as a function of the descriptors of `samples`.
+    fn loss_of(&self, samples: &[Sample]) -> Result<Box<LossOf<'static>>, TrainError> {
+        let pairs = || {
+            let images: Vec<(Side, u32)> = samples
+                .iter()
+                .map(|sample| (sample.side, sample.index as u32))
+                .collect();
+            Pairs::of(&self.set.spots, &images)
+        };
+        Ok(match self.config.loss {
+            Loss::Triplet { margin } => {
+                let count = samples.len() / 3;
+                Box::new(move |descriptors| {
+                    let role = |index: usize| descriptors.narrow(0, index * count, count);
+                    triplet_margin_loss(&role(0)?, &role(1)?, &role(2)?, margin)
+                })
+            }
+            Loss::InfoNce { temperature } => {
+                let pairs = pairs()?;
+                Box::new(move |descriptors| info_nce(descriptors, &pairs, temperature))
+            }
+            Loss::MultiSimilarity => {
+                let pairs = pairs()?;
+                Box::new(move |descriptors| multi_similarity(descriptors, &pairs))
+            }
+        })
     }
 }
 

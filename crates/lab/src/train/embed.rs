@@ -1,7 +1,8 @@
 //! Descriptors of many images under the present weights, outside the graph.
 
 use super::error::TrainError;
-use super::model::{Sample, TripletModel};
+use super::gradients::each_in_parallel;
+use super::model::{Graph, Sample, TripletModel};
 use super::triplets::{Side, TripletSet};
 use placeformer_core::progress::{Progress, Task};
 use std::collections::{BTreeSet, HashMap};
@@ -70,11 +71,16 @@ pub(super) fn embed(
     let task = Task::begin(progress, purpose, samples.len() as u64);
     let mut dim = 0;
     let mut rows = Vec::new();
-    for chunk in samples.chunks(model.embed_batch()) {
-        let descriptors = model.embed(set, chunk)?.detach();
-        dim = descriptors.dim(1)?;
-        rows.extend(descriptors.flatten_all()?.to_vec1::<f32>()?);
-        task.add(chunk.len() as u64);
-    }
+    let groups: Vec<&[Sample]> = samples.chunks(model.embed_batch()).collect();
+    each_in_parallel(
+        &groups,
+        |group| model.embed(set, group, Graph::Skipped),
+        |descriptors| {
+            dim = descriptors.dim(1)?;
+            rows.extend(descriptors.flatten_all()?.to_vec1::<f32>()?);
+            task.add(descriptors.dim(0)? as u64);
+            Ok(())
+        },
+    )?;
     Ok(Embeddings::new(dim, rows, row_of))
 }

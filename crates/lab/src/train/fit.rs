@@ -28,7 +28,7 @@ const MOST_LONG_VECTORS: usize = 2048;
 /// How the patch tokens of an image become one vector.
 #[derive(Debug, Clone, PartialEq)]
 pub enum AggregateChoice {
-    /// As given: the mean, or a generalised mean.
+    /// As given: the mean, a generalised mean, or one that was learnt before.
     Given(Aggregate),
     /// A VLAD of so many visual words, which are learnt from the images first.
     Vlad {
@@ -74,7 +74,14 @@ pub fn fit_head(
         unreadable: BTreeSet::new(),
     };
     let (head, images) = match choice {
-        AggregateChoice::Given(aggregate) => reader.fit_by_covariance(files, aggregate)?,
+        AggregateChoice::Given(aggregate) => {
+            if aggregate.pooled_dim(extractor.dim()) > extractor.dim() {
+                let files = spread(files, MOST_LONG_VECTORS);
+                reader.fit_by_vectors(&files, aggregate)?
+            } else {
+                reader.fit_by_covariance(files, aggregate)?
+            }
+        }
         AggregateChoice::Vlad { words, seed } => {
             let tokens = reader.sampled_tokens(files, seed)?;
             let words = VladWords::fit(&tokens, extractor.dim(), words, seed)?;
@@ -246,7 +253,8 @@ impl SetTokens {
 }
 
 /// The head that training starts from where none is given: what [`fit_head`] would make of the
-/// training images with the default whitening, each of which counts once even if it is both a query and a database image.
+/// training images with the default whitening, each of which counts once even if it is both a
+/// query and a database image.
 ///
 /// # Errors
 /// There are too few images.
@@ -296,6 +304,7 @@ fn distinct_rows<'a>(set: &TripletSet, tokens: &'a SetTokens, dim: usize) -> Vec
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::train::spots::Spots;
 
     #[test]
     fn a_file_on_both_sides_counts_once() {
@@ -305,6 +314,7 @@ mod tests {
             database: paths(&["a", "b"]),
             positives: vec![],
             near: vec![],
+            spots: Spots::default(),
         };
         let tokens = SetTokens {
             queries: vec![3.0, 4.0],

@@ -3,7 +3,7 @@
 use super::config::TrainConfig;
 use super::error::TrainError;
 use super::loss::normalise_rows;
-use super::model::{Sample, TripletModel};
+use super::model::{Graph, Group, Sample, TripletModel, Variable};
 use super::trainer::{Outcome, Session, run};
 use super::triplets::{Side, TripletSet};
 use candle_core::{Device, Tensor, Var};
@@ -84,11 +84,20 @@ impl HeadModel {
                 "cached tokens cannot be augmented; switch augmentation off".into(),
             ));
         }
-        let bound = Bound {
+        if config.finish.changes() {
+            return Err(TrainError::Setting(
+                "a head alone is neither averaged with its start nor fitted again".into(),
+            ));
+        }
+        run(&self.bound(training), training, validation, config, session)
+    }
+
+    /// The head with the caches of `training` and of any other set.
+    pub(super) fn bound<'a>(&'a self, training: &'a TripletSet) -> Bound<'a> {
+        Bound {
             head: self,
             training,
-        };
-        run(&bound, training, validation, config, session)
+        }
     }
 
     /// The weights, `[outputs, dim]` row-major, and the bias, `[outputs]`.
@@ -101,20 +110,30 @@ impl HeadModel {
 }
 
 /// A head that knows which of its two caches belongs to which set.
-struct Bound<'a> {
+pub(super) struct Bound<'a> {
     head: &'a HeadModel,
     training: &'a TripletSet,
 }
 
 impl TripletModel for Bound<'_> {
-    fn variables(&self) -> Vec<(String, Var)> {
+    fn variables(&self) -> Vec<Variable> {
+        let variable = |name: &str, variable: &Var| Variable {
+            name: name.into(),
+            variable: variable.clone(),
+            group: Group::Projection,
+        };
         vec![
-            ("head.weight".into(), self.head.weight.clone()),
-            ("head.bias".into(), self.head.bias.clone()),
+            variable("head.weight", &self.head.weight),
+            variable("head.bias", &self.head.bias),
         ]
     }
 
-    fn embed(&self, set: &TripletSet, samples: &[Sample]) -> Result<Tensor, TrainError> {
+    fn embed(
+        &self,
+        set: &TripletSet,
+        samples: &[Sample],
+        graph: Graph,
+    ) -> Result<Tensor, TrainError> {
         let tokens = if std::ptr::eq(set, self.training) {
             &self.head.training
         } else {
@@ -126,9 +145,11 @@ impl TripletModel for Bound<'_> {
             .map(|sample| tokens.side(sample.side).narrow(0, sample.index, 1))
             .collect();
         let rows = Tensor::cat(&rows?, 0)?;
-        let projected = rows
-            .matmul(&self.head.weight.t()?)?
-            .broadcast_add(&self.head.bias)?;
+        let [weight, bias] = [&self.head.weight, &self.head.bias].map(|variable| match graph {
+            Graph::Recorded => variable.as_tensor().clone(),
+            Graph::Skipped => variable.as_detached_tensor(),
+        });
+        let projected = rows.matmul(&weight.t()?)?.broadcast_add(&bias)?;
         Ok(normalise_rows(&projected)?)
     }
 

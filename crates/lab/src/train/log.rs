@@ -20,7 +20,10 @@ pub struct CycleRecord {
     pub loss: f32,
     /// Recall on the validation images after it.
     pub recall: ValidationRecall,
-    /// How long it took.
+    /// Mean seconds of a step.
+    #[serde(default)]
+    pub step_seconds: f64,
+    /// How long the cycle took, with mining and validation.
     pub seconds: f64,
 }
 

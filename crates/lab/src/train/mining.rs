@@ -66,6 +66,7 @@ pub(super) fn draw_pool(database: usize, most: usize, seed: u64) -> Vec<u32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::train::spots::Spots;
     use std::path::PathBuf;
 
     fn set(near: Vec<u32>, database: usize) -> TripletSet {
@@ -75,6 +76,7 @@ mod tests {
             database: paths(database),
             positives: vec![vec![0]],
             near: vec![near],
+            spots: Spots::default(),
         }
     }
 

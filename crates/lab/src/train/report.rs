@@ -20,7 +20,7 @@ pub fn html(
         ),
         (
             loss_chart(records),
-            "Mean triplet loss of each cycle, on negatives mined as it began.",
+            "Mean loss of each cycle, on hard negatives mined as it began.",
         ),
         (
             rate_chart(records),
@@ -59,12 +59,12 @@ pub fn verdict(outcome: &Outcome) -> String {
     } else {
         "ran to the end of its schedule"
     };
-    let gain = if outcome.best == outcome.initial {
+    let gain = if outcome.kept == outcome.initial {
         "validation never improved, so the weights are those it started from".to_owned()
     } else {
         format!(
             "validation recall@1 went from {:.1} to {:.1} percent",
-            outcome.initial.at_1, outcome.best.at_1
+            outcome.initial.at_1, outcome.kept.at_1
         )
     };
     format!("The run {end} after {} steps; {gain}.", outcome.steps)
@@ -76,7 +76,7 @@ fn recall_table(outcome: &Outcome) -> Markup {
         cells.extend([recall.at_1, recall.at_5, recall.at_10].map(|value| format!("{value:.1}")));
         cells
     };
-    let rows = [row("before", &outcome.initial), row("kept", &outcome.best)];
+    let rows = [row("before", &outcome.initial), row("kept", &outcome.kept)];
     table(
         "Validation recall in percent",
         &["weights", "R@1", "R@5", "R@10"],
@@ -185,13 +185,14 @@ mod tests {
             learning_rate: 5e-4,
             loss: 0.01,
             recall: recall(at_1),
+            step_seconds: 0.5,
             seconds: 1.0,
         };
         let gained = Outcome {
             steps: 200,
             stopped_early: true,
             initial: recall(50.5),
-            best: recall(70.25),
+            kept: recall(70.25),
             last_loss: 0.01,
         };
         let facts = [("data".to_owned(), "<set>".to_owned())];
@@ -213,7 +214,7 @@ mod tests {
         }
         assert!(!page.contains("<set>"));
         let nothing = Outcome {
-            best: recall(50.5),
+            kept: recall(50.5),
             ..gained
         };
         assert!(verdict(&nothing).contains("never improved"));

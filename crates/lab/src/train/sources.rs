@@ -3,8 +3,9 @@
 
 use super::error::TrainError;
 use super::holdout::Holdout;
+use super::spots::Reach;
 use super::triplets::TripletSet;
-use crate::datasets::{self, Dataset, DatasetKind, DatasetOptions};
+use crate::datasets::{self, Dataset, DatasetKind, DatasetOptions, GroundPart};
 use placeformer_core::folder::list_images;
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -21,10 +22,8 @@ pub struct Sources {
 /// Which images count as positives and negatives of a query.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TripletRule {
-    /// Greatest distance of a positive in metres.
-    pub positive_m: f64,
-    /// Distance in metres beyond which an image is a negative.
-    pub negative_m: f64,
+    /// Reach of positives and negatives in metres.
+    pub reach: Reach,
     /// Greatest frame distance of a positive in a drive.
     pub positive_frames: usize,
     /// Frame distance beyond which an image of the same drive is a negative.
@@ -75,6 +74,21 @@ impl Sources {
         Ok((training, validation))
     }
 
+    /// The images of a named part of the ground, and the frames of that part of each drive, with
+    /// `gap_frames` between two parts.
+    ///
+    /// # Errors
+    /// A set cannot be split.
+    pub fn part(&self, part: GroundPart, gap_frames: usize) -> Result<Self, TrainError> {
+        let mut sources = Self::default();
+        for dataset in &self.datasets {
+            sources.datasets.push(part.of(dataset)?);
+        }
+        let of_drive = |drive: &Vec<PathBuf>| part.of_drive(drive, gap_frames);
+        sources.drives = self.drives.iter().map(of_drive).collect();
+        Ok(sources)
+    }
+
     /// Finds the positives of every query, and what is too near to be a negative.
     ///
     /// # Errors
@@ -82,8 +96,7 @@ impl Sources {
     pub fn triplets(&self, rule: &TripletRule) -> Result<TripletSet, TrainError> {
         let mut sets = Vec::new();
         for dataset in &self.datasets {
-            let set = TripletSet::by_position(dataset, rule.positive_m, rule.negative_m)?;
-            sets.push(set);
+            sets.push(TripletSet::by_position(dataset, rule.reach)?);
         }
         if !self.drives.is_empty() {
             let positive = rule.positive_frames;

@@ -3,7 +3,7 @@
 
 use super::adam::Adam;
 use super::checkpoint::Checkpoint;
-use super::config::{TrainConfig, ValidationRecall};
+use super::config::{Keep, TrainConfig, ValidationRecall};
 use super::cycle::Cycle;
 use super::error::TrainError;
 use super::log::{CycleRecord, TrainLog};
@@ -25,7 +25,7 @@ pub struct Outcome {
     /// Recall before the first step.
     pub initial: ValidationRecall,
     /// Recall of the weights that were kept.
-    pub best: ValidationRecall,
+    pub kept: ValidationRecall,
     /// Mean loss of the last cycle.
     pub last_loss: f32,
 }
@@ -55,10 +55,11 @@ pub(super) fn run(
         identity,
         progress,
     } = session;
-    let mut adam = Adam::new(model.variables())?;
+    let mut adam = Adam::new(model.variables(), config.weight_decay)?;
+    let watch = || watch(model, training, validation, progress);
     let mut checkpoint = match Checkpoint::resume(&folder, config, &identity, &mut adam)? {
         Some(checkpoint) => checkpoint,
-        None => Checkpoint::start(&adam, validate(model, validation, progress)?)?,
+        None => Checkpoint::start(&adam, watch()?)?,
     };
     let mut log = TrainLog::open(&folder, checkpoint.steps)?;
     let steps = Task::begin(progress, "training", config.schedule.total);
@@ -77,36 +78,56 @@ pub(super) fn run(
     {
         let started = Instant::now();
         let until = (checkpoint.steps + config.steps_per_cycle).min(config.schedule.total);
-        let loss = cycle.run(&usable, &mut adam, checkpoint.steps..until)?;
-        let recall = validate(model, validation, progress)?;
-        checkpoint.record(&adam, until, loss, recall)?;
+        let taken = cycle.run(&usable, &mut adam, checkpoint.steps..until)?;
+        let recall = watch()?;
+        checkpoint.record(&adam, until, taken.loss, recall)?;
         checkpoint.save(&folder, config, &identity, &adam)?;
         let record = CycleRecord {
             step: until,
             learning_rate: config.schedule.rate(until - 1),
-            loss,
+            loss: taken.loss,
             recall,
+            step_seconds: taken.seconds,
             seconds: started.elapsed().as_secs_f64(),
         };
         log.append(&record)?;
         steps.set_note(cycle_note(&record));
     }
 
-    checkpoint.restore_best(&adam)?;
+    let kept = match config.keep {
+        Keep::Best => {
+            checkpoint.restore_best(&adam)?;
+            checkpoint.best
+        }
+        Keep::Last => checkpoint.last,
+    };
     Ok(Outcome {
         steps: checkpoint.steps,
         stopped_early: checkpoint.steps < config.schedule.total,
         initial: checkpoint.initial,
-        best: checkpoint.best,
+        kept,
         last_loss: checkpoint.last_loss,
     })
+}
+
+/// Recall of what would come out if the run ended now.
+fn watch(
+    model: &dyn TripletModel,
+    training: &TripletSet,
+    validation: &TripletSet,
+    progress: &dyn Progress,
+) -> Result<ValidationRecall, TrainError> {
+    match model.outcome(training, progress)? {
+        Some(outcome) => validate(outcome.as_ref(), validation, progress),
+        None => validate(model, validation, progress),
+    }
 }
 
 /// What is shown beside the steps after a cycle was validated, checkpointed and logged.
 fn cycle_note(record: &CycleRecord) -> String {
     format!(
-        "mean loss {:.4}, R@1 {:.1}, R@10 {:.1}",
-        record.loss, record.recall.at_1, record.recall.at_10
+        "mean loss {:.4}, R@1 {:.1}, R@10 {:.1}, {:.1} s a step",
+        record.loss, record.recall.at_1, record.recall.at_10, record.step_seconds
     )
 }
 

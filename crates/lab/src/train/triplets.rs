@@ -2,9 +2,11 @@
 //! 25 m).
 
 use super::error::TrainError;
+use super::spots::{Reach, Relation, Spot, Spots};
 use crate::datasets::{Dataset, Item, NeighbourGrid};
 use placeformer_core::geography::MetricPoint;
 use placeformer_core::types::ContentHash;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 /// One side of a triplet.
@@ -28,52 +30,75 @@ pub struct TripletSet {
     /// For each query, the database images too near to serve as negatives, ascending; includes the
     /// positives.
     pub near: Vec<Vec<u32>>,
+    /// Where all images were taken, from which any two can be related.
+    pub spots: Spots,
 }
 
 impl TripletSet {
-    /// Relations by position: positives within `positive_m` metres, negatives beyond `negative_m`.
+    /// Relations by position: positives within `reach.positive` metres that look the same way,
+    /// negatives beyond `reach.negative`.
     ///
     /// Images without a position are left out.
     ///
     /// # Errors
     /// The distances are out of order, or no query has both a positive and a negative.
-    pub fn by_position(
-        dataset: &Dataset,
-        positive_m: f64,
-        negative_m: f64,
-    ) -> Result<Self, TrainError> {
-        if !(positive_m > 0.0 && positive_m <= negative_m && negative_m.is_finite()) {
+    pub fn by_position(dataset: &Dataset, reach: Reach) -> Result<Self, TrainError> {
+        let Reach {
+            positive, negative, ..
+        } = reach;
+        if !(positive > 0.0 && positive <= negative && negative.is_finite()) {
             return Err(TrainError::Setting(format!(
-                "positives within {positive_m} m and negatives beyond {negative_m} m \
+                "positives within {positive} m and negatives beyond {negative} m \
                  leave no order between them"
             )));
         }
-        let queries = located(&dataset.queries);
-        let database = located(&dataset.database);
-        let near_of = |radius: f64| -> Vec<Vec<u32>> {
-            let grid = NeighbourGrid::new(radius, database.iter().map(|item| item.1).enumerate());
-            let around = |(query, point): &(&Item, MetricPoint)| {
-                // Coordinates of two cities may coincide.
-                let same_city = |&index: &usize| database[index].0.group == query.group;
-                let mut found: Vec<u32> = grid
-                    .within(*point)
-                    .filter(same_city)
-                    .map(|index| index as u32)
-                    .collect();
-                found.sort_unstable();
-                found
+        let areas = Areas::of(dataset);
+        let queries = areas.located(&dataset.queries);
+        let database = areas.located(&dataset.database);
+        let points = database.iter().map(|(_, spot)| MetricPoint {
+            east: spot.east,
+            north: spot.north,
+        });
+        let grid = NeighbourGrid::new(negative, points.enumerate());
+        let around = |query: &Spot, least: Relation| -> Vec<u32> {
+            let point = MetricPoint {
+                east: query.east,
+                north: query.north,
             };
-            queries.iter().map(around).collect()
+            let is_related = |&index: &usize| {
+                let other = &database[index].1;
+                // Coordinates of two cities may coincide.
+                let relation = reach.relation(query, other);
+                let is_near = relation == Relation::Positive || relation == least;
+                other.area == query.area && is_near
+            };
+            let mut found: Vec<u32> = grid
+                .within(point)
+                .filter(is_related)
+                .map(|index| index as u32)
+                .collect();
+            found.sort_unstable();
+            found
         };
-        let positives = near_of(positive_m);
-        let near = near_of(negative_m);
+        let rows = |least: Relation| -> Vec<Vec<u32>> {
+            let of_query = |(_, spot): &(&Item, Spot)| around(spot, least);
+            queries.iter().map(of_query).collect()
+        };
+        let positives = rows(Relation::Positive);
+        let near = rows(Relation::Ignored);
         let paths =
-            |items: &[(&Item, MetricPoint)]| items.iter().map(|item| item.0.path.clone()).collect();
+            |items: &[(&Item, Spot)]| items.iter().map(|item| item.0.path.clone()).collect();
+        let spots = |items: &[(&Item, Spot)]| items.iter().map(|item| item.1).collect();
         Self {
             queries: paths(&queries),
             database: paths(&database),
             positives,
             near,
+            spots: Spots {
+                queries: spots(&queries),
+                database: spots(&database),
+                areas: vec![reach; areas.count()],
+            },
         }
         .checked()
     }
@@ -98,8 +123,9 @@ impl TripletSet {
         let images: Vec<PathBuf> = drives.iter().flatten().cloned().collect();
         let mut positives = Vec::new();
         let mut near = Vec::new();
+        let mut spots = Vec::new();
         let mut first = 0;
-        for drive in drives {
+        for (area, drive) in drives.iter().enumerate() {
             for frame in 0..drive.len() {
                 let around = |reach: usize| {
                     let range = frame.saturating_sub(reach)..(frame + reach + 1).min(drive.len());
@@ -112,14 +138,30 @@ impl TripletSet {
                         .collect(),
                 );
                 near.push(around(negative_frames).collect());
+                spots.push(Spot {
+                    area: area as u32,
+                    east: frame as f64,
+                    north: 0.0,
+                    heading: None,
+                });
             }
             first += drive.len();
         }
+        let reach = Reach {
+            positive: positive_frames as f64,
+            degrees: None,
+            negative: negative_frames as f64,
+        };
         Self {
             queries: images.clone(),
             database: images,
             positives,
             near,
+            spots: Spots {
+                queries: spots.clone(),
+                database: spots,
+                areas: vec![reach; drives.len()],
+            },
         }
         .checked()
     }
@@ -135,6 +177,7 @@ impl TripletSet {
             database: vec![],
             positives: vec![],
             near: vec![],
+            spots: Spots::default(),
         };
         for set in sets {
             let first = all.database.len() as u32;
@@ -146,6 +189,7 @@ impl TripletSet {
             all.near.extend(shift(set.near));
             all.queries.extend(set.queries);
             all.database.extend(set.database);
+            all.spots.append(set.spots);
         }
         all.checked()
     }
@@ -167,6 +211,7 @@ impl TripletSet {
                 bytes.extend(index.to_le_bytes());
             }
         }
+        self.spots.write_to(&mut bytes);
         ContentHash::of(&bytes).to_string()
     }
 
@@ -197,17 +242,46 @@ impl TripletSet {
     }
 }
 
-fn located(items: &[Item]) -> Vec<(&Item, MetricPoint)> {
-    items
-        .iter()
-        .filter_map(|item| Some((item, item.position?)))
-        .collect()
+/// The cities of a data set, whose coordinates may coincide.
+struct Areas<'a>(BTreeMap<Option<&'a str>, u32>);
+
+impl<'a> Areas<'a> {
+    fn of(dataset: &'a Dataset) -> Self {
+        let both_sides = dataset.queries.iter().chain(&dataset.database);
+        let groups: BTreeSet<Option<&str>> = both_sides.map(|item| item.group.as_deref()).collect();
+        Self(groups.into_iter().zip(0..).collect())
+    }
+
+    fn count(&self) -> usize {
+        self.0.len()
+    }
+
+    /// The items with a position, each with its spot.
+    fn located<'i>(&self, items: &'i [Item]) -> Vec<(&'i Item, Spot)> {
+        let locate = |item: &'i Item| {
+            let point = item.position?;
+            let spot = Spot {
+                area: *self.0.get(&item.group.as_deref())?,
+                east: point.east,
+                north: point.north,
+                heading: item.heading,
+            };
+            Some((item, spot))
+        };
+        items.iter().filter_map(locate).collect()
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::datasets::Truth;
+
+    const PAPER: Reach = Reach {
+        positive: 10.0,
+        degrees: None,
+        negative: 25.0,
+    };
 
     fn at(name: &str, east: f64) -> Item {
         Item {
@@ -237,17 +311,48 @@ mod tests {
             at("d25", 25.0),
             at("d26", 26.0),
         ];
-        let set =
-            TripletSet::by_position(&dataset(database, vec![at("q", 0.0)]), 10.0, 25.0).unwrap();
+        let set = TripletSet::by_position(&dataset(database, vec![at("q", 0.0)]), PAPER).unwrap();
         assert_eq!(set.positives, [[0, 1]]);
         assert_eq!(set.near, [[0, 1, 2, 3]]);
     }
 
     #[test]
+    fn an_image_that_looks_elsewhere_is_no_positive_and_no_negative() {
+        let looking = |item: Item, heading: f64| Item {
+            heading: Some(heading),
+            ..item
+        };
+        let database = vec![
+            looking(at("same", 5.0), 20.0),
+            looking(at("back", 5.0), 180.0),
+            at("unknown", 5.0),
+            looking(at("far", 26.0), 0.0),
+        ];
+        let reach = Reach {
+            degrees: Some(40.0),
+            ..PAPER
+        };
+        let queries = vec![looking(at("q", 0.0), 350.0)];
+        let set = TripletSet::by_position(&dataset(database, queries), reach).unwrap();
+        assert_eq!(set.positives, [[0, 2]]);
+        assert_eq!(set.near, [[0, 1, 2]]);
+        for index in 0..4 {
+            let relation = set
+                .spots
+                .relation((Side::Query, 0), (Side::Database, index));
+            assert_eq!(
+                set.positives[0].contains(&index),
+                relation == Relation::Positive
+            );
+            assert_eq!(set.near[0].contains(&index), relation != Relation::Negative);
+        }
+    }
+
+    #[test]
     fn images_without_a_position_are_left_out_and_nothing_to_learn_is_an_error() {
         let database = vec![Item::new("lost", "lost"), at("far", 1000.0)];
-        let error = TripletSet::by_position(&dataset(database, vec![at("q", 0.0)]), 10.0, 25.0)
-            .unwrap_err();
+        let error =
+            TripletSet::by_position(&dataset(database, vec![at("q", 0.0)]), PAPER).unwrap_err();
         assert!(matches!(error, TrainError::NoTriplets(_)), "{error}");
     }
 
@@ -258,12 +363,8 @@ mod tests {
             ..item
         };
         let database = vec![city(at("a", 0.0), "x"), city(at("b", 0.0), "y")];
-        let set = TripletSet::by_position(
-            &dataset(database, vec![city(at("q", 1.0), "y")]),
-            10.0,
-            25.0,
-        )
-        .unwrap();
+        let set = TripletSet::by_position(&dataset(database, vec![city(at("q", 1.0), "y")]), PAPER)
+            .unwrap();
         assert_eq!(
             (&set.positives, &set.near),
             (&vec![vec![1]], &vec![vec![1]])
@@ -300,5 +401,14 @@ mod tests {
         assert_eq!(set.positives[2], [1, 3]);
         assert_eq!(set.near[4], [2, 3, 4]);
         assert_eq!(set.usable().count(), 10);
+        for query in 0..10 {
+            for other in 0..10 {
+                let relation = set
+                    .spots
+                    .relation((Side::Query, query), (Side::Database, other));
+                let is_near = set.near[query as usize].contains(&other);
+                assert_eq!(is_near, relation != Relation::Negative);
+            }
+        }
     }
 }

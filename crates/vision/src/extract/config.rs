@@ -1,12 +1,14 @@
 //! Settings of extraction: every point that the paper leaves open, by name.
 
 use super::encoder::{EncoderSpec, Precision};
+use super::error::ExtractError;
 use super::preset::{Geometry, Preset};
+use super::weights::{Difference, VitWeights};
 use placeformer_core::types::{ImageSize, InvalidValue, PoolingStride, SCALES};
 use serde::{Deserialize, Serialize};
 use std::convert::Infallible;
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use utoipa::ToSchema;
 
@@ -24,6 +26,11 @@ pub struct ExtractConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>)]
     pub weights: Option<PathBuf>,
+    /// Difference file: what training changed of the weights, as `train` wrote it. It is merged
+    /// when the model is loaded, and refused if it belongs to other weights.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
+    pub difference: Option<PathBuf>,
     /// Size in pixels that images are squashed to, such as { width = 448, height = 336 }. Each side
     /// is a multiple of the patch size. Unless set, it is the preset's own.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -67,6 +74,7 @@ impl Default for ExtractConfig {
         Self {
             preset: Preset::default(),
             weights: None,
+            difference: None,
             input_size: None,
             exit_block: None,
             token_norm: None,
@@ -164,6 +172,20 @@ impl ExtractConfig {
             attention_block: Some(spec.attention_block),
             ..self.clone()
         })
+    }
+
+    /// Loads the weights at `path`, and merges the difference that the settings name.
+    ///
+    /// # Errors
+    /// Those of [`VitWeights::load`], [`Difference::load`] and [`Difference::merge`].
+    pub fn load_weights(&self, path: &Path) -> Result<VitWeights, ExtractError> {
+        let weights = VitWeights::load(path, self.preset, self.heads)?;
+        match &self.difference {
+            None => Ok(weights),
+            Some(file) => Difference::load(file)?
+                .merge(&weights)
+                .map_err(|error| error.in_file(file)),
+        }
     }
 
     fn validate(&self, spec: &EncoderSpec) -> Result<(), InvalidValue> {

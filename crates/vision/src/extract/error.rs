@@ -3,7 +3,7 @@
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{ImageSize, InvalidValue};
 use placeformer_kernels::SimdError;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Why extraction, or loading what it needs, failed.
 #[derive(Debug, thiserror::Error)]
@@ -62,6 +62,16 @@ pub enum ExtractError {
         head_backbone: String,
         /// The backbone it was to be used with.
         backbone: String,
+    },
+    /// The difference belongs to other weights.
+    #[error(
+        "the difference belongs to weights whose content hash is {base}, and these have {weights}"
+    )]
+    DifferenceMismatch {
+        /// Content hash that the difference names.
+        base: String,
+        /// Content hash of the weights it was to be merged with.
+        weights: String,
     },
     /// No head is built in for this backbone.
     #[error(
@@ -163,9 +173,10 @@ impl ExtractError {
         match self {
             Self::Simd(SimdError::Disagrees { .. }) => ErrorCode::Internal,
             Self::Simd(_) | Self::Config(_) => ErrorCode::InvalidParameter,
-            Self::HeadMismatch { .. } | Self::NoHead { .. } | Self::AggregateMismatch { .. } => {
-                ErrorCode::ModelMismatch
-            }
+            Self::HeadMismatch { .. }
+            | Self::DifferenceMismatch { .. }
+            | Self::NoHead { .. }
+            | Self::AggregateMismatch { .. } => ErrorCode::ModelMismatch,
             Self::WrongPooledLength { .. } => ErrorCode::CorruptRecord,
             Self::Io { .. }
             | Self::BadFile { .. }
@@ -178,6 +189,17 @@ impl ExtractError {
             | Self::Compute(_)
             | Self::TooFewTokens { .. }
             | Self::TooFewImages { .. } => ErrorCode::Internal,
+        }
+    }
+
+    /// The same error, about the file at `path` if it named none.
+    pub(super) fn in_file(self, path: &Path) -> Self {
+        match self {
+            Self::BadFile { reason, .. } => Self::BadFile {
+                path: path.to_owned(),
+                reason,
+            },
+            other => other,
         }
     }
 

@@ -39,11 +39,11 @@ impl Extractor {
     pub fn load(config: &ExtractConfig, weights: &Path) -> Result<Self, ExtractError> {
         config.encoder_spec()?;
         record::verify(weights)?;
-        let weights = VitWeights::load(weights, config.preset, config.heads)?;
+        let weights = config.load_weights(weights)?;
         Self::from_weights(config, &weights, &config.head)
     }
 
-    /// As [`Extractor::load`], from weights in memory.
+    /// As [`Extractor::load`], from weights in memory, with which a difference was merged already.
     ///
     /// # Errors
     /// As [`Extractor::load`], but for reading the weights.

@@ -17,7 +17,7 @@
 //! extractor -> model_id, selection, trace, fused -> vit -> weights, positions, encoder
 //! model_id, pca -> head -> aggregate -> netvlad -> vlad -> global
 //! pca, netvlad -> components
-//! config -> encoder -> preset
+//! config -> weights, encoder -> preset
 //! all of them -> error
 //! ```
 
@@ -46,6 +46,7 @@ mod vit;
 mod vlad;
 mod weights;
 
+pub use activation::gelu;
 pub use aggregate::Aggregate;
 pub use components::Covariance;
 pub use config::{ExtractConfig, HeadChoice};
@@ -68,4 +69,4 @@ pub use selection::{key_patches, select};
 pub use trace::{ExtractionTrace, TraceArray, TraceValues};
 pub use vit::CandleEncoder;
 pub use vlad::{VladWords, sample_tokens};
-pub use weights::{BlockWeights, Linear, Norm, VitWeights};
+pub use weights::{BlockWeights, Difference, Factors, Linear, Merged, Norm, VitWeights};

@@ -7,6 +7,9 @@
 //! preset, weights, exit block     input     key patches        pooling  head
 //! ```
 //!
+//! Weights with which a difference was merged are named by the hash of those before, and the
+//! difference by its own: `dinov2-vits14:0f1e2d3c4b5a:d112233445566:b8`.
+//!
 //! The pooling is left out if it is the mean, so that models made before there was a choice keep
 //! their identity. The precision is left out, because descriptors compare across precisions. When a
 //! map is given another head, only the last part changes ([`Head::rebind`]).
@@ -25,17 +28,16 @@ const HEAD_MARK: &str = ":h";
 /// Hexadecimal digits of a hash that are part of an identity.
 const HASH_DIGITS: usize = 12;
 
-/// The part of the identity that tokens depend on: preset, weights, number of heads if it is not
-/// the preset's, exit block, and `n` if tokens pass the final LayerNorm. A head depends on exactly
-/// this.
+/// The part of the identity that tokens depend on: preset, weights, difference, number of heads if
+/// it is not the preset's, exit block, and `n` if tokens pass the final LayerNorm. A head depends
+/// on exactly this.
 pub(super) fn backbone_id(
     config: &ExtractConfig,
     spec: &EncoderSpec,
     weights: &VitWeights,
 ) -> String {
     let preset = config.preset;
-    let hash = weights.content_hash();
-    let hash = &hash[..HASH_DIGITS];
+    let hash = weights_id(weights);
     let heads = weights.geometry.heads;
     let heads = if heads == preset.geometry().heads {
         String::new()
@@ -45,6 +47,19 @@ pub(super) fn backbone_id(
     let block = spec.exit_block;
     let norm = if spec.token_norm { "n" } else { "" };
     format!("{preset}:{hash}{heads}:b{block}{norm}")
+}
+
+/// Hash of the weights; of merged ones the hash of those before and of the difference.
+fn weights_id(weights: &VitWeights) -> String {
+    let start = |hash: &str| hash[..HASH_DIGITS].to_owned();
+    match &weights.merged {
+        None => start(&weights.content_hash()),
+        Some(merged) => {
+            let base = start(&merged.base);
+            let difference = start(&merged.difference);
+            format!("{base}:d{difference}")
+        }
+    }
 }
 
 /// The whole identity.
@@ -122,7 +137,8 @@ fn parse<'a>(identity: &'a str, backbone: &str) -> Option<ParsedIdentity<'a>> {
     // The colon keeps `...:b8` from matching `...:b80`.
     let settings = before_head.strip_prefix(backbone)?.strip_prefix(':')?;
     let last = settings.rsplit(':').next().unwrap_or(settings);
-    if last.starts_with("gem") || last.starts_with("vlad") {
+    let poolings = ["gem", "vlad", "netvlad"];
+    if poolings.iter().any(|pooling| last.starts_with(pooling)) {
         let without_pooling = before_head.len() - last.len() - 1;
         Some(ParsedIdentity {
             without_head: &before_head[..without_pooling],
@@ -139,6 +155,7 @@ fn parse<'a>(identity: &'a str, backbone: &str) -> Option<ParsedIdentity<'a>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::extract::netvlad::{NetVlad, NetVladParameters};
     use crate::extract::vlad::VladWords;
     use placeformer_core::types::GLOBAL_DIM;
 
@@ -158,9 +175,16 @@ mod tests {
         .unwrap()
     }
 
-    fn kinds() -> [Aggregate; 4] {
+    fn kinds() -> [Aggregate; 5] {
         let vlad = |value| Aggregate::Vlad(VladWords::new(vec![value; 8], 4).unwrap());
+        let netvlad = NetVlad::new(NetVladParameters {
+            mean: vec![0.1; 4],
+            projection: vec![0.5; 8],
+            words: vec![0.25; 4],
+            assignment: vec![2.0; 4],
+        });
         [
+            Aggregate::NetVlad(Box::new(netvlad.unwrap())),
             Aggregate::Mean,
             Aggregate::gem(3.0).unwrap(),
             Aggregate::gem(2.5).unwrap(),

@@ -1,19 +1,26 @@
 //! The differentiable transformer: the same numbers as the one that serves, right gradients, and a
 //! run on drawn places.
 
+mod streets;
+
 use super::*;
 use crate::synth::{Condition, StreetWorld, Viewpoint};
 use crate::train::Schedule;
 use crate::train::interruption::InterruptAfter;
 use crate::train::loss::triplet_margin_loss;
+use crate::train::model::Graph;
+use crate::train::spots::in_groups;
 use crate::train::triplets::Side;
+use candle_core::{Device, Var};
+use placeformer_core::types::GLOBAL_DIM;
 use placeformer_core::types::ImageSize;
 use placeformer_vision::extract::{
-    BlockWeights, CandleEncoder, Encoder, Geometry, Linear, Norm, Preset,
+    Aggregate, BlockWeights, CandleEncoder, Encoder, Geometry, Linear, Norm, Preset,
 };
 use placeformer_vision::image::{RgbImage, encode_png};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use std::path::Path;
 
 const GEOMETRY: Geometry = Geometry {
     depth: 3,
@@ -80,26 +87,49 @@ fn weights() -> VitWeights {
             .collect(),
         norm: norm(rng),
         unused_parameters: 0,
+        merged: None,
     }
 }
 
-fn model(trainable: TrainableBlocks, token_norm: bool) -> BackboneModel {
+fn model(blocks: TrainableBlocks, token_norm: bool) -> BackboneModel {
+    varied_model(blocks, token_norm, Augmentation::NONE)
+}
+
+fn varied_model(
+    blocks: TrainableBlocks,
+    token_norm: bool,
+    augmentation: Augmentation,
+) -> BackboneModel {
     let mut rng = ChaCha8Rng::seed_from_u64(6);
-    let head = (
-        random(&mut rng, GLOBAL_DIM * GEOMETRY.dim),
-        random(&mut rng, GLOBAL_DIM),
-    );
-    let images = ImageConfig::default();
-    let augmentation = Augmentation::NONE;
+    let weight = random(&mut rng, GLOBAL_DIM * GEOMETRY.dim);
+    let bias = random(&mut rng, GLOBAL_DIM);
+    let head = Head::new(Aggregate::Mean, weight, bias, "b", BTreeMap::new()).unwrap();
+    let source = TokenSource::Images {
+        limits: ImageConfig::default(),
+        augmentation,
+    };
+    let trainable = Trainable {
+        blocks,
+        rank: None,
+        seed: 0,
+    };
+    let finish = Finish::default();
     BackboneModel::new(
         weights(),
         spec(token_norm),
-        (&head.0, &head.1),
+        &head,
         trainable,
-        images,
-        augmentation,
+        source,
+        finish,
     )
     .unwrap()
+}
+
+fn pass(model: &BackboneModel) -> Pass<'_> {
+    Pass {
+        weights: &model.weights,
+        graph: Graph::Recorded,
+    }
 }
 
 fn images(count: usize) -> Vec<ImageTensor> {
@@ -117,7 +147,7 @@ fn tokens_are_those_of_the_encoder_that_serves() {
     for token_norm in [false, true] {
         let model = model(TrainableBlocks::All, token_norm);
         let images = images(3);
-        let trained = model.tokens(&images).unwrap();
+        let trained = model.tokens(pass(&model), &images).unwrap();
         let served = CandleEncoder::new(&weights(), &spec(token_norm))
             .unwrap()
             .encode(&images)
@@ -143,7 +173,7 @@ fn tokens_are_those_of_the_encoder_that_serves() {
 
 /// Loss used for checking gradients: anything that depends on every token unevenly.
 fn loss(model: &BackboneModel, images: &[ImageTensor]) -> Tensor {
-    let tokens = model.tokens(images).unwrap();
+    let tokens = model.tokens(pass(model), images).unwrap();
     let count = tokens.elem_count();
     let uneven: Vec<f32> = (0..count)
         .map(|i| ((i * 7919 % 101) as f32 - 50.0) / 50.0)
@@ -169,7 +199,7 @@ fn gradients_of_every_kind_of_weight_agree_with_finite_differences() {
         "norm.bias",
     ];
     for name in names {
-        let variable = &model.variables[name];
+        let variable = &model.weights.variables()[name];
         let analytic = gradients
             .get(variable.as_tensor())
             .unwrap_or_else(|| panic!("no gradient of {name}"));
@@ -204,7 +234,8 @@ fn gradients_of_every_kind_of_weight_agree_with_finite_differences() {
 fn only_the_blocks_asked_for_move() {
     let names = |trainable| {
         model(trainable, false)
-            .variables
+            .weights
+            .variables()
             .keys()
             .cloned()
             .collect::<Vec<_>>()
@@ -223,18 +254,8 @@ fn only_the_blocks_asked_for_move() {
     );
     // Without a norm behind the exit block its weights have no gradient, and are left alone.
     assert!(!all.iter().any(|name| name.starts_with("norm.")));
-    let head = (vec![0.0; GLOBAL_DIM * 8], vec![0.0; GLOBAL_DIM]);
-    let images = ImageConfig::default();
-    let trainable = TrainableBlocks::Last(3);
-    let made = BackboneModel::new(
-        weights(),
-        spec(false),
-        (&head.0, &head.1),
-        trainable,
-        images,
-        Augmentation::NONE,
-    );
-    assert!(made.is_err());
+    assert!(TrainableBlocks::Last(3).first_of(2).is_err());
+    assert!(TrainableBlocks::Last(0).first_of(2).is_err());
 }
 
 #[test]
@@ -294,6 +315,7 @@ fn eight_places(folder: &Path, picture: impl Fn(u64) -> RgbImage) -> TripletSet 
             .map(|image| group(image).filter(|&other| other != image).collect())
             .collect(),
         near: (0..16).map(|image| group(image).collect()).collect(),
+        spots: in_groups(16, 2),
         queries: images.clone(),
         database: images,
     }
@@ -321,10 +343,7 @@ fn train_in(
     config: &TrainConfig,
     stop_after: u64,
 ) -> Option<(BackboneModel, Outcome)> {
-    let model = BackboneModel {
-        augmentation: config.augmentation,
-        ..model(TrainableBlocks::Last(1), false)
-    };
+    let model = varied_model(TrainableBlocks::Last(1), false, config.augmentation);
     let interrupt = InterruptAfter(stop_after);
     let session = Session {
         folder: folder.to_owned(),
@@ -339,7 +358,8 @@ fn train_in(
 fn values(model: &BackboneModel) -> Vec<(String, Vec<f32>)> {
     let flat = |variable: &Var| variable.flatten_all().unwrap().to_vec1::<f32>().unwrap();
     model
-        .variables
+        .weights
+        .variables()
         .iter()
         .map(|(name, variable)| (name.clone(), flat(variable)))
         .collect()
@@ -352,7 +372,7 @@ fn eight_drawn_places_are_learnt_to_zero_loss() {
     let (_, outcome) = train_in(&folder.path().join("run"), &set, &config(240), u64::MAX).unwrap();
     assert!(outcome.initial.at_1 < 100.0, "{outcome:?}");
     assert_eq!(
-        (outcome.last_loss, outcome.best.at_1),
+        (outcome.last_loss, outcome.kept.at_1),
         (0.0, 100.0),
         "{outcome:?}"
     );
@@ -401,21 +421,21 @@ fn gradients_through_head_and_loss_agree_with_finite_differences() {
     // Two triplets; the margin is so wide that both count.
     let samples = [0, 6, 1, 7, 12, 2].map(|index| sample(Side::Database, index));
     let value = || {
-        let descriptors = model.embed(&set, &samples).unwrap();
+        let descriptors = model.embed(&set, &samples, Graph::Recorded).unwrap();
         let part = |role: usize| descriptors.narrow(0, role * 2, 2).unwrap();
         triplet_margin_loss(&part(0), &part(1), &part(2), 1.0).unwrap()
     };
     let gradients = value().backward().unwrap();
     let names = [
-        HEAD_WEIGHT,
-        HEAD_BIAS,
+        pooling::WEIGHT,
+        pooling::BIAS,
         "blocks.1.mlp.fc2.weight",
         "blocks.0.attn.qkv.weight",
         "patch_embed.proj.weight",
         "norm.weight",
     ];
     for name in names {
-        let variable = &model.variables[name];
+        let variable = &model.weights.variables()[name];
         let analytic = gradients
             .get(variable.as_tensor())
             .unwrap_or_else(|| panic!("no gradient of {name}"));

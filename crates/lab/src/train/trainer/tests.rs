@@ -3,8 +3,10 @@
 use super::*;
 use crate::train::head::{HeadModel, PooledTokens};
 use crate::train::interruption::InterruptAfter;
+use crate::train::loss::Loss;
 use crate::train::mining::draw_pool;
-use crate::train::model::Sample;
+use crate::train::model::{Graph, Group, Sample, Variable};
+use crate::train::spots::{Spots, in_groups};
 use crate::train::{Augmentation, Schedule};
 use candle_core::{Tensor, Var};
 use placeformer_core::progress::{Silent, Step};
@@ -36,6 +38,7 @@ fn eight_places() -> (TripletSet, Vec<f32>) {
             .map(|image| group(image).filter(|&other| other != image).collect())
             .collect(),
         near: (0..24).map(|image| group(image).collect()).collect(),
+        spots: in_groups(24, 3),
         queries: images.clone(),
         database: images,
     };
@@ -60,7 +63,7 @@ fn config(total: u64) -> TrainConfig {
         steps_per_cycle: 20,
         patience: 1000,
         augmentation: Augmentation::NONE,
-        margin: 0.2,
+        loss: Loss::Triplet { margin: 0.2 },
         ..TrainConfig::default()
     }
 }
@@ -91,7 +94,7 @@ fn eight_places_are_learnt_to_zero_loss() {
     let outcome = train_in(folder.path(), &head(&tokens), &set, &config(600), u64::MAX).unwrap();
     assert!(outcome.initial.at_1 < 90.0, "{outcome:?}");
     assert_eq!(
-        (outcome.last_loss, outcome.best.at_1),
+        (outcome.last_loss, outcome.kept.at_1),
         (0.0, 100.0),
         "{outcome:?}"
     );
@@ -181,7 +184,7 @@ impl Progress for Recorder {
 struct Counting {
     weight: Var,
     value: f32,
-    described: std::cell::RefCell<Vec<Sample>>,
+    described: Mutex<Vec<Sample>>,
 }
 
 impl Counting {
@@ -198,12 +201,16 @@ impl Counting {
 }
 
 impl TripletModel for Counting {
-    fn variables(&self) -> Vec<(String, Var)> {
-        vec![("weight".into(), self.weight.clone())]
+    fn variables(&self) -> Vec<Variable> {
+        vec![Variable {
+            name: "weight".into(),
+            variable: self.weight.clone(),
+            group: Group::Projection,
+        }]
     }
 
-    fn embed(&self, _: &TripletSet, samples: &[Sample]) -> Result<Tensor, TrainError> {
-        self.described.borrow_mut().extend_from_slice(samples);
+    fn embed(&self, _: &TripletSet, samples: &[Sample], _: Graph) -> Result<Tensor, TrainError> {
+        self.described.lock().unwrap().extend_from_slice(samples);
         Ok((self.weight.broadcast_as((samples.len(), 4))? * f64::from(self.value))?)
     }
 
@@ -267,6 +274,7 @@ fn a_cycle_costs_its_queries_their_positives_and_the_pool_however_large_the_data
     let set = TripletSet {
         queries: paths("q", asking),
         database: paths("d", answering),
+        spots: Spots::default(),
         near: positives.clone(),
         positives,
     };
@@ -277,7 +285,7 @@ fn a_cycle_costs_its_queries_their_positives_and_the_pool_however_large_the_data
         ..config(1000)
     };
     let model = Counting::new(1.0);
-    let mut adam = Adam::new(model.variables()).unwrap();
+    let mut adam = Adam::new(model.variables(), 0.0).unwrap();
     let usable: Vec<usize> = set.usable().collect();
     let recorder = Recorder::default();
     let steps = Task::begin(&recorder, "training", 1000);
@@ -289,16 +297,16 @@ fn a_cycle_costs_its_queries_their_positives_and_the_pool_however_large_the_data
         progress: &recorder,
         steps: &steps,
     };
-    let loss = cycle.run(&usable, &mut adam, 40..45).unwrap();
+    let loss = cycle.run(&usable, &mut adam, 40..45).unwrap().loss;
     let mut shown = recorder.steps.lock().unwrap().clone();
     shown.dedup();
     let announced = recorder.mined.lock().unwrap().unwrap();
     // All descriptors coincide, so every triplet costs the margin.
-    assert!((f64::from(loss) - config.margin).abs() < 1e-6, "{loss}");
+    assert!((f64::from(loss) - 0.2).abs() < 1e-6, "{loss}");
     assert_eq!(shown, [0, 40, 41, 42, 43, 44, 45]);
     let asked = 5 * 4;
     let trained = 5 * 3 * 4;
-    let described = model.described.borrow().len();
+    let described = model.described.lock().unwrap().len();
     assert_eq!(described, announced + trained);
     assert!(
         (100..=asked + 2 * asked + 100).contains(&announced),
@@ -336,4 +344,35 @@ fn queries_without_a_negative_in_the_pool_are_not_asked() {
         cycle.draw(&usable[..3], &[0, 2], 0..1),
         Err(TrainError::NoTriplets(_))
     ));
+}
+
+#[test]
+fn the_last_weights_come_out_where_they_are_asked_for() {
+    let (set, tokens) = eight_places();
+    // So large a step that validation gets worse at once.
+    let config = |keep: Keep| TrainConfig {
+        keep,
+        schedule: Schedule {
+            peak: 50.0,
+            warm_up: 0,
+            total: 20,
+        },
+        ..config(20)
+    };
+    let run = |keep: Keep| {
+        let folder = tempfile::tempdir().unwrap();
+        let model = head(&tokens);
+        let outcome = train_in(folder.path(), &model, &set, &config(keep), u64::MAX).unwrap();
+        let last = crate::train::read_log(folder.path())
+            .unwrap()
+            .pop()
+            .unwrap();
+        (outcome, last.recall, model.weights().unwrap())
+    };
+    let (best, _, kept) = run(Keep::Best);
+    let (outcome, last, moved) = run(Keep::Last);
+    assert_eq!(outcome.kept, last);
+    assert!(best.kept.criterion() >= last.criterion());
+    assert_eq!(kept == moved, best.kept == last, "{:?} {last:?}", best.kept);
+    assert_ne!(moved, head(&tokens).weights().unwrap());
 }

@@ -72,6 +72,7 @@ fn small(seed: u64, layer_scale: bool) -> VitWeights {
     VitWeights {
         preset: Preset::Dinov2Vits14,
         unused_parameters: 0,
+        merged: None,
         geometry,
         position_grid: (5, 5),
         patch_embed: random.linear(64, 3 * 14 * 14),

@@ -8,11 +8,14 @@
 //! fused form. The content hash covers that form, so equal weights have one identity, however they
 //! were named and stored.
 //!
-//! `vit_weights` holds the weights, their names and their hash; `read` takes them out of a file.
+//! `vit_weights` holds the weights, their names and their hash; `read` takes them out of a file;
+//! `difference` is what training changes of them.
 
+mod difference;
 mod read;
 #[cfg(test)]
 mod tests;
 mod vit_weights;
 
+pub use difference::{Difference, Factors, Merged};
 pub use vit_weights::{BlockWeights, Linear, Norm, VitWeights};

@@ -226,6 +226,7 @@ impl<'a> Reader<'a> {
             blocks: blocks.into_iter().collect::<Option<_>>()?,
             norm: norm?,
             unused_parameters: 0,
+            merged: None,
         })
     }
 

@@ -1,5 +1,6 @@
 //! The weights of a backbone, their names in the fused naming, and their hash.
 
+use super::difference::Merged;
 use crate::extract::error::ExtractError;
 use crate::extract::preset::{Geometry, Preset};
 use placeformer_core::files::write_atomically;
@@ -68,6 +69,9 @@ pub struct VitWeights {
     /// Number of learned values in the file that the method does not use, such as DINOv2's mask
     /// token.
     pub unused_parameters: usize,
+    /// What they were merged of, if a difference was. It is part of their identity in memory, and
+    /// is not written with them.
+    pub merged: Option<Merged>,
 }
 
 /// A tensor by its fused name and shape.

@@ -3,7 +3,7 @@
 use candle_core::{Result, Tensor};
 
 /// Mean over a batch of max(|q - p|^2 - |q - n|^2 + margin, 0); all three are `[batch, dim]`.
-pub(super) fn triplet_margin_loss(
+pub(crate) fn triplet_margin_loss(
     query: &Tensor,
     positive: &Tensor,
     negative: &Tensor,
@@ -15,7 +15,7 @@ pub(super) fn triplet_margin_loss(
 }
 
 /// Divides each row of `[n, dim]` by its Euclidean length, differentiably.
-pub(super) fn normalise_rows(rows: &Tensor) -> Result<Tensor> {
+pub(crate) fn normalise_rows(rows: &Tensor) -> Result<Tensor> {
     // The floor keeps the gradient finite for a row of zeros.
     let length = (rows.sqr()?.sum_keepdim(1)? + 1e-24)?.sqrt()?;
     rows.broadcast_div(&length)
