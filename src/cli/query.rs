@@ -94,6 +94,9 @@ fn print_answer(answer: &Value) -> Result<(), OutputError> {
         let trust = if matched { "trusted" } else { "not trusted" };
         say!("the best answer is {trust}: confidence {confidence:.3}")?;
     }
+    if answer["unmatched_reason"] == "image_uninformative" {
+        say!("the photo shows nothing to know a place by")?;
+    }
     print_timings(answer)
 }
 

@@ -120,6 +120,8 @@ pub(super) fn new_reference() -> Value {
         "heading": 270,
         "captured_at": "2026-05-17T09:30:00Z",
         "metadata": {"camera": "left"},
+        // The example's image is one grey pixel.
+        "allow_uninformative": true,
     })
 }
 
@@ -185,6 +187,7 @@ pub(super) fn query_answer() -> Value {
         "reranked": true,
         "matched": true,
         "confidence": 0.996,
+        "unmatched_reason": null,
         "timings_ms": {
             "decode": 6.1,
             "queue": 0.4,

@@ -12,6 +12,30 @@ pub struct MatchConfidence {
     pub matched: Option<bool>,
     /// Probability, 0 to 1, that the best answer is right; `None` where no calibration can be used.
     pub confidence: Option<f64>,
+    /// Why the best answer is not trusted; `None` where it is, or where nothing is known.
+    pub reason: Option<UnmatchedReason>,
+}
+
+/// Why the best answer is not trusted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum UnmatchedReason {
+    /// There is no answer.
+    NoResults,
+    /// The photo shows nothing by which a place could be known.
+    ImageUninformative,
+    /// Its confidence is below the threshold of the calibration.
+    LowConfidence,
+}
+
+impl MatchConfidence {
+    /// Certainly no match.
+    pub(super) fn unmatched(reason: UnmatchedReason) -> Self {
+        Self {
+            matched: Some(false),
+            confidence: Some(0.0),
+            reason: Some(reason),
+        }
+    }
 }
 
 /// What the best answer of a query is judged by.
@@ -54,10 +78,7 @@ impl Calibrations {
         best: Option<BestAnswer>,
     ) -> MatchConfidence {
         let Some(best) = best else {
-            return MatchConfidence {
-                matched: Some(false),
-                confidence: Some(0.0),
-            };
+            return MatchConfidence::unmatched(UnmatchedReason::NoResults);
         };
         let Some(curve) = self.curve(model, own, best.spatial_score.is_some()) else {
             return MatchConfidence::default();
@@ -65,9 +86,11 @@ impl Calibrations {
         let spatial_score = best.spatial_score.map(f64::from);
         let global_distance = f64::from(best.global_distance);
         let confidence = curve.weights.confidence(spatial_score, global_distance);
+        let matched = curve.trusts(confidence);
         MatchConfidence {
-            matched: Some(curve.trusts(confidence)),
+            matched: Some(matched),
             confidence: Some(confidence),
+            reason: (!matched).then_some(UnmatchedReason::LowConfidence),
         }
     }
 
@@ -191,6 +214,8 @@ mod tests {
         assert_eq!(of_model.matched, Some(true));
         let unsure = calibrations.assess(model, None, answer(Some(3), 1.2));
         assert_eq!(unsure.matched, Some(false));
+        assert_eq!(unsure.reason, Some(UnmatchedReason::LowConfidence));
+        assert_eq!(of_model.reason, None);
 
         let of_map = assess_sure(Some(&calibration("r", -9.0)));
         assert!(
@@ -229,10 +254,7 @@ mod tests {
         );
         assert_eq!(
             calibrations.assess(model, None, None),
-            MatchConfidence {
-                matched: Some(false),
-                confidence: Some(0.0)
-            }
+            MatchConfidence::unmatched(UnmatchedReason::NoResults)
         );
         let refused = calibrations
             .check(&"m".parse().unwrap(), &calibration("other", 0.0))

@@ -4,7 +4,7 @@ use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{ExternalId, InvalidValue, MapName, ModelId, RerankId};
 use placeformer_store::StoreError;
 use placeformer_vision::extract::ExtractError;
-use placeformer_vision::image::ImageError;
+use placeformer_vision::image::{ImageError, Uninformative};
 use std::time::Duration;
 
 /// Everything that can end a request early.
@@ -13,6 +13,9 @@ pub enum PipelineError {
     /// The image was refused.
     #[error(transparent)]
     Image(#[from] ImageError),
+    /// The image to be stored shows nothing by which a place could be known.
+    #[error("the image shows no place: {0}; allow_uninformative stores it all the same")]
+    Uninformative(Uninformative),
     /// The decoder panicked on this image; the process goes on.
     #[error("the decoder failed on this image")]
     DecoderPanicked,
@@ -114,6 +117,7 @@ impl PipelineError {
     pub fn code(&self) -> ErrorCode {
         match self {
             Self::Image(error) => error.code(),
+            Self::Uninformative(_) => ErrorCode::ImageUninformative,
             Self::DecoderPanicked => ErrorCode::ImageUndecodable,
             Self::Extract(error) => error.code(),
             Self::Store(error) => error.code(),

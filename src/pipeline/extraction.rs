@@ -1,5 +1,5 @@
 //! From the bytes of an image to its descriptor: decoding on a few threads, extraction on one
-//! compute worker.
+//! compute worker. Between the two it is seen whether the image shows anything at all.
 //!
 //! Blocking work cannot be stopped once it has begun, but the request that waits for it may go away
 //! at any moment. So every permit, lock and ticket that bounds such work moves into it and is given
@@ -14,10 +14,11 @@ use super::blocking::{Panicked, blocking};
 use super::caller::Caller;
 use super::fair::{FairPermit, FairSemaphore};
 use super::{DescriptorSource, PipelineError, Timings};
+use crate::ops::metrics::ImageUse;
 use crate::ops::{Metrics, PipelineStage};
 use bytes::Bytes;
 use placeformer_core::types::{Deadline, Descriptor, ImageTensor};
-use placeformer_vision::image::ImageConfig;
+use placeformer_vision::image::{Detail, ImageConfig, Uninformative};
 use std::cell::Cell;
 use std::future::Future;
 use std::sync::Arc;
@@ -33,7 +34,18 @@ pub(super) enum Purpose {
     /// A query or a match, of no use after its deadline.
     Answer(Deadline),
     /// A reference to be stored; it lets queries go first.
-    Ingest,
+    Ingest {
+        /// Whether it is stored although it shows nothing by which a place could be known.
+        allow_uninformative: bool,
+    },
+}
+
+/// A descriptor with what is known about its image.
+#[derive(Debug)]
+pub(super) struct Described {
+    pub(super) descriptor: Descriptor,
+    /// What the image lacks, if it shows nothing by which a place could be known.
+    pub(super) lacks: Option<Uninformative>,
 }
 
 /// The model behind its bounds.
@@ -88,7 +100,27 @@ impl Purpose {
             Self::Answer(deadline) => timeout(deadline.remaining(), work)
                 .await
                 .map_err(|_| PipelineError::DeadlineExceeded { stage }),
-            Self::Ingest => Ok(work.await),
+            Self::Ingest { .. } => Ok(work.await),
+        }
+    }
+
+    fn image_use(self) -> ImageUse {
+        match self {
+            Self::Answer(_) => ImageUse::Query,
+            Self::Ingest { .. } => ImageUse::Reference,
+        }
+    }
+
+    /// Refuses a reference that shows no place, before anything is computed for it.
+    fn check_information(self, lacks: Option<Uninformative>) -> Result<(), PipelineError> {
+        match (self, lacks) {
+            (
+                Self::Ingest {
+                    allow_uninformative: false,
+                },
+                Some(lacks),
+            ) => Err(PipelineError::Uninformative(lacks)),
+            _ => Ok(()),
         }
     }
 }
@@ -124,8 +156,12 @@ impl Extraction {
         purpose: Purpose,
         ticket: &Arc<Ticket>,
         timings: &mut Timings,
-    ) -> Result<Descriptor, PipelineError> {
-        let tensor = self.decode(bytes, purpose, ticket, timings).await?;
+    ) -> Result<Described, PipelineError> {
+        let (tensor, lacks) = self.decode(bytes, purpose, ticket, timings).await?;
+        if lacks.is_some() {
+            self.metrics.uninformative_image(purpose.image_use());
+        }
+        purpose.check_information(lacks)?;
 
         let waiting_since = Instant::now();
         let permit = self.worker_permit(purpose, ticket.caller());
@@ -145,22 +181,28 @@ impl Extraction {
         timings.record(&self.metrics, PipelineStage::Queue, waited + lent);
         let extracted = extracted?;
         timings.record(&self.metrics, PipelineStage::Extract, extracted.computed);
-        extracted.descriptor
+        Ok(Described {
+            descriptor: extracted.descriptor?,
+            lacks,
+        })
     }
 
-    /// Bytes to the tensor that the model sees.
+    /// Bytes to the tensor that the model sees, and what the image lacks.
     async fn decode(
         &self,
         bytes: Bytes,
         purpose: Purpose,
         ticket: &Arc<Ticket>,
         timings: &mut Timings,
-    ) -> Result<ImageTensor, PipelineError> {
+    ) -> Result<(ImageTensor, Option<Uninformative>), PipelineError> {
         let source = self.source.clone();
         let config = self.image.clone();
         let decoding = self.on_decoder_thread(ticket, move || {
             let started = Instant::now();
-            let decoded = source.decode(&bytes, &config);
+            let decoded = source.decode(&bytes, &config).map(|tensor| {
+                let lacks = Detail::of(&tensor).lacks();
+                (tensor, lacks)
+            });
             (decoded, started.elapsed())
         });
         let decoded = purpose.within_deadline("decoding", decoding).await?;
@@ -172,7 +214,7 @@ impl Extraction {
     /// Waits for the compute worker; at most one reference waits for it among the queries.
     async fn worker_permit(&self, purpose: Purpose, caller: &Caller) -> WorkerPermit {
         match purpose {
-            Purpose::Ingest => {
+            Purpose::Ingest { .. } => {
                 let ingest = self.ingest.acquire(caller).await;
                 WorkerPermit {
                     worker: self.worker.acquire_behind().await,

@@ -27,6 +27,8 @@ pub struct IngestRequest {
     /// Whether position, heading and time are taken from the photo's EXIF and XMP where `fields`
     /// has none.
     pub reads_photo: bool,
+    /// Whether it is stored although it shows nothing by which a place could be known.
+    pub allow_uninformative: bool,
 }
 
 /// Where a field of a reference comes from.
@@ -116,7 +118,8 @@ impl Service {
     ///
     /// # Errors
     /// Disk, memory or queue are full; the image, the metadata or the map's model do not fit; the
-    /// external id names another image; the store fails.
+    /// image shows nothing by which a place could be known, unless that is allowed; the external id
+    /// names another image; the store fails.
     pub async fn ingest(
         self: &Arc<Self>,
         caller: &Caller,
@@ -144,16 +147,19 @@ impl Service {
         let sources = FieldSources::complete(&mut fields, &photo);
 
         let mut timings = Timings::default();
-        let descriptor = self
+        let purpose = Purpose::Ingest {
+            allow_uninformative: request.allow_uninformative,
+        };
+        let described = self
             .extraction
-            .describe(request.image, Purpose::Ingest, &ticket, &mut timings)
+            .describe(request.image, purpose, &ticket, &mut timings)
             .await?;
         let new = NewReference {
             map: request.map,
             fields,
             content_hash,
             model,
-            descriptor,
+            descriptor: described.descriptor,
         };
         let started = Instant::now();
         let committed = self.commit(new, ticket).await;

@@ -120,7 +120,7 @@ impl Service {
         timings: &mut Timings,
     ) -> Result<Arc<PackedPatches>, PipelineError> {
         let describing = self.extraction.describe(image, purpose, ticket, timings);
-        Ok(Arc::new(describing.await?.patches))
+        Ok(Arc::new(describing.await?.descriptor.patches))
     }
 
     /// The key patches of a reference, if they can be compared with this server's.

@@ -43,7 +43,7 @@ mod source;
 mod startup;
 mod timings;
 
-pub use calibrations::MatchConfidence;
+pub use calibrations::{MatchConfidence, UnmatchedReason};
 pub use caller::{Caller, network_of};
 pub use config::PipelineConfig;
 pub use error::PipelineError;

@@ -8,9 +8,9 @@
 
 use super::blocking::blocking;
 use super::calibrations::BestAnswer;
-use super::extraction::Purpose;
+use super::extraction::{Described, Purpose};
 use super::maps::LiveMap;
-use super::{Caller, MatchConfidence, PipelineError, Service, Timings};
+use super::{Caller, MatchConfidence, PipelineError, Service, Timings, UnmatchedReason};
 use crate::ops::PipelineStage;
 use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
@@ -140,7 +140,7 @@ impl Service {
         let ticket = Arc::new(self.queries.admit(caller, max_wait)?);
 
         let mut timings = Timings::default();
-        let descriptor = self
+        let described = self
             .extraction
             .describe(request.image, purpose, &ticket, &mut timings)
             .await?;
@@ -148,7 +148,7 @@ impl Service {
 
         let service = self.clone();
         let answering = blocking(move || {
-            let answer = service.answer(&plan, &descriptor, timings);
+            let answer = service.answer(&plan, &described, timings);
             service.follow_damage();
             drop(ticket);
             answer
@@ -190,9 +190,10 @@ impl Service {
     fn answer(
         &self,
         plan: &QueryPlan,
-        query: &Descriptor,
+        described: &Described,
         mut timings: Timings,
     ) -> Result<QueryAnswer, PipelineError> {
+        let query = &described.descriptor;
         let neighbours = self.search(plan, query, &mut timings);
         let reranking = self.rerank(plan, query, &neighbours, &mut timings)?;
         let reranked = reranking.is_some();
@@ -205,7 +206,8 @@ impl Service {
         };
 
         let results = self.with_metadata(plan, ranking)?;
-        let confidence = self.confidence(plan, results.first(), reranked);
+        let shows_nothing = described.lacks.is_some();
+        let confidence = self.confidence(plan, results.first(), reranked, shows_nothing);
         Ok(QueryAnswer {
             results,
             reranked,
@@ -373,21 +375,26 @@ impl Service {
         Ok(results)
     }
 
-    /// How far the best result can be trusted, by the calibration in force; counted in the metrics.
+    /// How far the best result can be trusted, by the calibration in force; not at all if the photo
+    /// shows nothing by which a place could be known. Counted in the metrics.
     fn confidence(
         &self,
         plan: &QueryPlan,
         best: Option<&QueryResult>,
         reranked: bool,
+        shows_nothing: bool,
     ) -> MatchConfidence {
         let best = best.map(|best| BestAnswer {
             spatial_score: best.score.as_ref().map(|score| score.spatial_score),
             global_distance: best.global_distance,
         });
         let own = plan.map.calibration();
-        let confidence = self
-            .calibrations
-            .assess(&plan.map.model, own.as_deref(), best);
+        let calibrations = &self.calibrations;
+        let confidence = if shows_nothing {
+            MatchConfidence::unmatched(UnmatchedReason::ImageUninformative)
+        } else {
+            calibrations.assess(&plan.map.model, own.as_deref(), best)
+        };
 
         let spatial_score = best.and_then(|best| best.spatial_score).unwrap_or(0);
         let top1_score = reranked.then_some(spatial_score);

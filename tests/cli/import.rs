@@ -5,6 +5,8 @@ use crate::common::noise;
 use crate::common::photo::{Says, png_with_exif, with_chunk};
 use crate::common::program::{has_model, offline, placeformer, words};
 use crate::common::service::App;
+use placeformer_core::types::ImageSize;
+use placeformer_vision::image::{RgbImage, encode_png};
 use serde_json::{Value, json};
 use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt;
@@ -321,6 +323,26 @@ fn one_photo_is_imported_and_a_folder_without_any_says_what_it_holds() {
     let from = ["--positions", "p.csv"];
     served.import_from("photos/one.png", &from).succeeded();
     assert_eq!(served.stored("one.png").0, at(1.0, 2.0));
+}
+
+#[test]
+fn photos_that_show_nothing_are_reported_and_imported_on_demand() {
+    let served = Served::new();
+    served.photo("street.png");
+    let size = ImageSize {
+        width: 64,
+        height: 48,
+    };
+    let dark = encode_png(&RgbImage::filled(size, [3, 2, 2])).unwrap();
+    served.write("dark.png", &dark);
+    let imported = served.import(&[]).failed();
+    assert_eq!(
+        imported.verdict("dark.png"),
+        ("failed", "image_uninformative")
+    );
+    assert_eq!(imported.verdict("street.png").0, "created");
+    let imported = served.import(&["--allow-uninformative"]).succeeded();
+    assert_eq!(imported.verdict("dark.png").0, "created");
 }
 
 #[test]

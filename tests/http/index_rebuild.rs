@@ -226,6 +226,7 @@ impl History {
             fields: fields.clone(),
             image,
             reads_photo: true,
+            allow_uninformative: false,
         };
         let answer = self
             .runtime

@@ -119,6 +119,9 @@ error_codes! {
     /// The bytes are not a readable image.
     ImageUndecodable = "image_undecodable", 422, false, None,
         "The image cannot be decoded";
+    /// The image shows nothing by which a place could be known.
+    ImageUninformative = "image_uninformative", 422, false, None,
+        "The image shows nothing to know a place by";
     /// The bytes are not a head.
     HeadUnreadable = "head_unreadable", 422, false, None,
         "The head cannot be read";

@@ -70,6 +70,7 @@ impl MeasuredService for RunningPipeline {
                 fields: ReferenceFields::default(),
                 image,
                 reads_photo: false,
+                allow_uninformative: false,
             };
             self.service.ingest(&Caller::Local, request).await
         };

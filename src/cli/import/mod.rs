@@ -30,7 +30,7 @@ use placeformer_core::printable::Printable;
 use placeformer_core::types::MapName;
 use positions::{Positions, folder_of};
 use report::{ImportReport, PhotoRecord, Summary, describe_ignored};
-use server_sink::ServerSink;
+use server_sink::{PhotoTreatment, ServerSink};
 use sink::Sink;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicUsize;
@@ -92,6 +92,9 @@ pub struct ImportArgs {
     /// Leave alone what the photos say about themselves in EXIF and XMP.
     #[arg(long)]
     no_exif: bool,
+    /// Import photos that show nothing to know a place by (dark, blank, a covered lens), too.
+    #[arg(long)]
+    allow_uninformative: bool,
     /// UTM zone and band, such as 33T, of @utm_east@utm_north@... names that do not give it.
     #[arg(long, value_name = "ZONE")]
     utm_zone: Option<UtmZone>,
@@ -248,13 +251,21 @@ fn open_sink(args: &ImportArgs) -> anyhow::Result<Box<dyn Sink>> {
         return Ok(Box::new(ServerSink::new(
             server,
             args.attempts,
-            args.no_exif,
+            PhotoTreatment {
+                ignores_exif: args.no_exif,
+                allows_uninformative: args.allow_uninformative,
+            },
         )?));
     }
     let Some(data) = &args.data else {
         bail!("give --server or --data");
     };
-    let sink = StoreSink::open(data, args.config.as_deref(), args.model.clone())?;
+    let sink = StoreSink::open(
+        data,
+        args.config.as_deref(),
+        args.model.clone(),
+        args.allow_uninformative,
+    )?;
     Ok(Box::new(sink))
 }
 

@@ -19,8 +19,16 @@ const PAGE: &str = "1000";
 /// A server as a sink.
 pub(super) struct ServerSink {
     client: ServerClient,
-    /// Whether the server is told to leave alone what the photos say about themselves.
-    ignores_exif: bool,
+    treatment: PhotoTreatment,
+}
+
+/// How the server is told to treat photos, where not as usual.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct PhotoTreatment {
+    /// It leaves alone what the photos say about themselves.
+    pub(super) ignores_exif: bool,
+    /// It stores photos that show nothing by which a place could be known.
+    pub(super) allows_uninformative: bool,
 }
 
 /// One page of a map's references; of each reference what an import compares.
@@ -69,13 +77,10 @@ impl ServerSink {
     pub(super) fn new(
         server: ServerArgs,
         attempts: u32,
-        ignores_exif: bool,
+        treatment: PhotoTreatment,
     ) -> anyhow::Result<Self> {
         let client = ServerClient::with_attempts(server, attempts)?;
-        Ok(Self {
-            client,
-            ignores_exif,
-        })
+        Ok(Self { client, treatment })
     }
 
     /// The page that begins at `cursor`; `None` if there is no such map.
@@ -121,8 +126,11 @@ impl Sink for ServerSink {
 
     fn send(&self, upload: Upload) -> Sent {
         let mut parameters = parameters(&upload);
-        if self.ignores_exif {
+        if self.treatment.ignores_exif {
             parameters.push(("exif", "false".to_owned()));
+        }
+        if self.treatment.allows_uninformative {
+            parameters.push(("allow_uninformative", "true".to_owned()));
         }
         let request = |connection: &Connection| -> RequestBuilder {
             connection
@@ -281,7 +289,7 @@ mod tests {
             trust: TrustArgs::default(),
             timeout: 10,
         };
-        ServerSink::new(args, attempts, false).unwrap()
+        ServerSink::new(args, attempts, PhotoTreatment::default()).unwrap()
     }
 
     fn upload() -> Upload {

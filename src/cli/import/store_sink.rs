@@ -19,6 +19,8 @@ use tokio::runtime::Runtime;
 pub(super) struct StoreSink {
     service: Arc<Service>,
     runtime: Runtime,
+    /// Whether photos are stored that show nothing by which a place could be known.
+    allow_uninformative: bool,
 }
 
 /// References listed at once when resuming.
@@ -31,6 +33,7 @@ impl StoreSink {
         data: &Path,
         config: Option<&Path>,
         model: ModelOverrides,
+        allow_uninformative: bool,
     ) -> anyhow::Result<Self> {
         let overrides = Overrides {
             data: Some(data.to_owned()),
@@ -54,7 +57,11 @@ impl StoreSink {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .enable_all()
             .build()?;
-        Ok(Self { service, runtime })
+        Ok(Self {
+            service,
+            runtime,
+            allow_uninformative,
+        })
     }
 
     fn page(&self, map: &MapName, after: Option<Cursor>) -> Result<Page, PipelineError> {
@@ -95,6 +102,7 @@ impl Sink for StoreSink {
             image,
             // The import has read the photo, and knows more about it.
             reads_photo: false,
+            allow_uninformative: self.allow_uninformative,
         };
         let ingested = self
             .runtime

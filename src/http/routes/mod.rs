@@ -34,6 +34,7 @@ pub static ROUTES: &[Route] = &[
         access_log: AccessLog::Logged,
         body: RequestBody::Images(&references::UPLOAD),
         own_errors: &[
+            ErrorCode::ImageUninformative,
             ErrorCode::ExternalIdConflict,
             ErrorCode::ModelMismatch,
             ErrorCode::CorruptRecord,

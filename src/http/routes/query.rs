@@ -6,7 +6,7 @@ use crate::http::body::{ImageUpload, read_upload};
 use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
-use crate::pipeline::{QueryAnswer, QueryOptions, QueryRequest, QueryResult};
+use crate::pipeline::{QueryAnswer, QueryOptions, QueryRequest, QueryResult, UnmatchedReason};
 use axum::Extension;
 use axum::extract::{Request, State};
 use axum::http::StatusCode;
@@ -147,12 +147,15 @@ pub struct QueryAnswerBody {
     /// Whether the order comes from re-ranking; else it is the order of global distance.
     pub reranked: bool,
     /// Whether the first result is trusted: its confidence reaches the threshold of the map's
-    /// calibration, else of the model's. False without any result; null if there is no calibration.
+    /// calibration, else of the model's. False without any result, and for a photo that shows nothing
+    /// to know a place by; else null if there is no calibration.
     pub matched: Option<bool>,
-    /// Probability that the first result shows the right place; 0 without any result; null if there
-    /// is no calibration.
+    /// Probability that the first result shows the right place; 0 without any result, and for a photo
+    /// that shows nothing to know a place by; else null if there is no calibration.
     #[schema(minimum = 0, maximum = 1, example = 0.97)]
     pub confidence: Option<f64>,
+    /// Why the first result is not trusted; null if it is, or if there is no calibration.
+    pub unmatched_reason: Option<UnmatchedReasonName>,
     /// Milliseconds per stage, as in the `Server-Timing` header.
     #[schema(
         value_type = std::collections::HashMap<String, f64>,
@@ -161,6 +164,30 @@ pub struct QueryAnswerBody {
     pub timings_ms: BTreeMap<&'static str, f64>,
     /// The model that computed it.
     pub model: String,
+}
+
+/// Why a first result is not trusted: there is none (`no_results`), the photo shows nothing by which
+/// a place could be known (`image_uninformative`: a dark or blank frame, a covered lens), or its
+/// confidence is below the threshold (`low_confidence`).
+#[derive(Debug, Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum UnmatchedReasonName {
+    /// There is no result.
+    NoResults,
+    /// The photo shows nothing by which a place could be known.
+    ImageUninformative,
+    /// The confidence is below the threshold.
+    LowConfidence,
+}
+
+impl From<UnmatchedReason> for UnmatchedReasonName {
+    fn from(reason: UnmatchedReason) -> Self {
+        match reason {
+            UnmatchedReason::NoResults => Self::NoResults,
+            UnmatchedReason::ImageUninformative => Self::ImageUninformative,
+            UnmatchedReason::LowConfidence => Self::LowConfidence,
+        }
+    }
 }
 
 /// One place found.
@@ -289,6 +316,7 @@ fn answer_body(answer: QueryAnswer) -> QueryAnswerBody {
         reranked: answer.reranked,
         matched: answer.confidence.matched,
         confidence: answer.confidence.confidence,
+        unmatched_reason: answer.confidence.reason.map(Into::into),
         timings_ms: timings_ms(&answer.timings),
         model: answer.model.to_string(),
     }

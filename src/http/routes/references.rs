@@ -89,6 +89,12 @@ pub struct ReferenceParams {
     #[schema(default = true)]
     #[param(example = true)]
     pub exif: Option<bool>,
+    /// Whether a photo is stored that shows nothing by which a place could be known: a dark or blank
+    /// frame, a covered lens. By default it is refused (`image_uninformative`), because every other
+    /// such frame would be found there.
+    #[schema(default = false)]
+    #[param(example = false)]
+    pub allow_uninformative: Option<bool>,
 }
 
 impl ReferenceParams {
@@ -117,6 +123,9 @@ impl ReferenceParams {
 /// fields as query parameters, or a multipart part `image` beside a part `json`, or base64 in JSON
 /// beside the fields. Position, heading and time that the request leaves out are taken from the
 /// photo's own EXIF or XMP, unless `exif` is false; `sources` says where each comes from.
+///
+/// A photo that shows nothing by which a place could be known is refused, unless
+/// `allow_uninformative` is true.
 #[utoipa::path(
     post,
     path = "/references",
@@ -155,6 +164,7 @@ pub async fn create(
     let mut upload = read_upload::<ReferenceParams>(&state, request, &UPLOAD).await?;
     let image = upload.take("image")?;
     let reads_photo = upload.params.exif.unwrap_or(true);
+    let allow_uninformative = upload.params.allow_uninformative.unwrap_or(false);
     let (map, fields) = std::mem::take(&mut upload.params).checked()?;
     access.check_map(&map)?;
     let new = IngestRequest {
@@ -162,6 +172,7 @@ pub async fn create(
         fields,
         image,
         reads_photo,
+        allow_uninformative,
     };
     let answer = service.ingest(&access.caller, new).await?;
     let location = HeaderValue::from_str(&format!("/references/{}", answer.reference.id));

@@ -199,3 +199,25 @@ impl ConnectionCut {
         }
     }
 }
+
+/// What an image is for; the values of `uninformative_images_total{kind}`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ImageUse {
+    /// A place is looked for, or two images are matched.
+    Query,
+    /// It is to be stored.
+    Reference,
+}
+
+impl ImageUse {
+    /// All uses.
+    pub const ALL: [Self; 2] = [Self::Query, Self::Reference];
+
+    /// Its label.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Query => "query",
+            Self::Reference => "reference",
+        }
+    }
+}

@@ -6,7 +6,9 @@
 
 mod labels;
 
-pub use labels::{ConnectionCut, ConnectionKind, MemoryComponent, PipelineStage, Rejection};
+pub use labels::{
+    ConnectionCut, ConnectionKind, ImageUse, MemoryComponent, PipelineStage, Rejection,
+};
 
 use super::logging;
 use placeformer_core::types::MapName;
@@ -70,6 +72,7 @@ pub struct Metrics {
     ready: IntGauge,
     disk_free_bytes: IntGauge,
     cache_lookups: IntCounterVec,
+    uninformative_images: IntCounterVec,
     lost_log_lines: LostLogLines,
     connections: ConnectionSeries,
 }
@@ -123,6 +126,11 @@ impl Metrics {
                 "Key patches asked of the cache.",
                 &["result"],
             )?,
+            uninformative_images: series.counters(
+                "uninformative_images_total",
+                "Images that show nothing to know a place by.",
+                &["kind"],
+            )?,
             lost_log_lines: LostLogLines::new(&series)?,
             connections: ConnectionSeries::new(&series)?,
             registry: series.0,
@@ -146,6 +154,10 @@ impl Metrics {
         }
         for result in ["hit", "miss"] {
             self.cache_lookups.with_label_values(&[result]);
+        }
+        for kind in ImageUse::ALL {
+            self.uninformative_images
+                .with_label_values(&[kind.as_str()]);
         }
         for kind in ConnectionKind::ALL {
             self.set_connections(kind, 0);
@@ -219,6 +231,12 @@ impl Metrics {
         if matched == Some(false) {
             self.queries.unmatched.inc();
         }
+    }
+
+    /// An image was measured that shows nothing by which a place could be known.
+    pub fn uninformative_image(&self, kind: ImageUse) {
+        let series = &self.uninformative_images;
+        series.with_label_values(&[kind.as_str()]).inc();
     }
 
     /// So many damaged records were found that had not been found before.
@@ -497,6 +515,7 @@ mod tests {
             "placeformer_queue_depth 0",
             "placeformer_query_top1_score_count 0",
             "placeformer_query_unmatched_total 0",
+            "placeformer_uninformative_images_total{kind=\"query\"} 0",
             "placeformer_log_lines_dropped_total 0",
             "placeformer_rejected_total{reason=\"storage_lost\"} 0",
             "placeformer_build_info{version=",

@@ -58,7 +58,7 @@ impl PointPairs {
 
     /// All coordinates of one axis (x, y, u, v) in counting order, filled up with NaN.
     #[inline(always)]
-    pub(super) fn axis(&self, axis: usize) -> &[f32] {
+    pub fn axis(&self, axis: usize) -> &[f32] {
         &self.coordinates[axis]
     }
 }

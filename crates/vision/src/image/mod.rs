@@ -19,6 +19,7 @@
 //! | `png`, `webp` | decoding these |
 //! | `orientation` | turning an image upright |
 //! | `resize` | resizing and normalisation |
+//! | `information` | whether an image shows anything by which a place could be known |
 //! | `encode` | back to JPEG and PNG |
 //! | `exif` | position, heading and time of a photo, from its EXIF and XMP |
 
@@ -28,6 +29,7 @@ mod encode;
 mod error;
 mod exif;
 mod header;
+mod information;
 mod jpeg;
 mod load;
 mod orientation;
@@ -41,6 +43,7 @@ pub use encode::{encode_jpeg, encode_png};
 pub use error::ImageError;
 pub use exif::{ExifInfo, ExifSources, MetadataBlock, read_exif};
 pub use header::is_image;
+pub use information::{Detail, Uninformative};
 pub use load::{decode, load_tensor};
 pub use resize::{DEVIATION, MEAN};
 pub use rgb::RgbImage;

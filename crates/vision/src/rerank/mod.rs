@@ -9,6 +9,7 @@
 //! |---|---|
 //! | `mutual_nn` | 6: pairs of patches that are each other's nearest |
 //! | `ransac`, `frame`, `proper_samples`, `refine` | 7: the homography that most pairs agree with |
+//! | `view` | which homographies a camera can cause |
 //! | `score` | 8: inliers added up over the configured combinations of scales |
 //! | `reranker` | all candidates of a query, in parallel |
 //! | `config`, `outcome` | what goes in, and what comes out |
@@ -26,6 +27,7 @@ mod reranker;
 mod score;
 #[cfg(test)]
 mod tests;
+mod view;
 
 pub use config::RerankConfig;
 pub use outcome::{

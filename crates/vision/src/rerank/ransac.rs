@@ -4,8 +4,9 @@
 //! Four correspondences determine a homography. Random samples of four are drawn and screened; from
 //! those that pass, homographies are computed, and the correspondences that agree with each are
 //! counted. Whenever one beats the best so far, a least-squares fit on the correspondences near it
-//! tries to gain more. The search stops when a sample without outliers would have been drawn with
-//! the required confidence, if the best share of inliers found so far were the true one.
+//! tries to gain more. A homography that no camera can cause ([`View`]) does not count, however many
+//! inliers it has. The search stops when a sample without outliers would have been drawn with the
+//! required confidence, if the best share of inliers found so far were the true one.
 //!
 //! Correspondences are sorted, and the random generator is seeded from their coordinates. So the
 //! result depends on the correspondences alone: not on their order, on time, threads, or the
@@ -14,6 +15,7 @@
 use super::frame::Frame;
 use super::proper_samples::{CHUNK, ProperSamples};
 use super::refine::refit;
+use super::view::{InlierMoments, View};
 use placeformer_kernels::Simd;
 use placeformer_kernels::homography::{self, PointPairs, Sample, Sampler};
 
@@ -31,6 +33,14 @@ const ROUND: usize = 8;
 /// Reaches of the successive least-squares fits after an improvement, in tolerances. The first one
 /// is wide, because the homography of a sample is inexact.
 const LOCAL_RADII: [f64; 4] = [1.5, 1.2, 1.0, 1.0];
+
+/// Inliers from which on it is looked at how they lie before a homography is taken for the best. Of
+/// fewer it is looked at in the end, because false matches have as many again and again.
+const EXAMINED_FROM: usize = 8;
+
+/// Examining how inliers lie takes as long as scoring so many homographies, and counts as such: so
+/// that correspondences on a line, where every homography is refused, take no longer than others.
+const COST_OF_EXAMINING: usize = 8;
 
 /// Settings of the search.
 #[derive(Debug, Clone, Copy)]
@@ -51,6 +61,8 @@ pub(super) struct Estimate {
     pub(super) homography: [f64; 9],
     /// Number of inliers; see [`is_inlier`].
     pub(super) inliers: u32,
+    /// How the inliers lie and see the plane; lengths are in pixels.
+    pub(super) view: View,
 }
 
 /// Working memory of one thread.
@@ -63,8 +75,8 @@ pub(super) struct Ransac {
 impl Ransac {
     /// Finds the homography of `correspondences` (`x, y` in query, `u, v` in reference pixels).
     ///
-    /// `None` if there are fewer than four, or no four of them form a proper quadrilateral in both
-    /// images.
+    /// `None` if there are fewer than four, no four of them form a proper quadrilateral in both
+    /// images, or no camera can cause what most of them agree with.
     pub(super) fn estimate(
         &mut self,
         simd: Simd,
@@ -84,15 +96,17 @@ impl Ransac {
         let mut search = Search::new(simd, &self.points, settings);
         search.run(seed_of(&self.sorted));
         let homography = frame.denormalise(&search.homography?);
-        let inliers = self
-            .sorted
-            .iter()
-            .filter(|&&pair| is_inlier(&homography, pair, settings.tolerance_px))
-            .count();
-        Some(Estimate {
-            homography,
-            inliers: inliers as u32,
-        })
+        let tolerance_px = settings.tolerance_px;
+        let pairs = self.sorted.iter().copied();
+        let inliers = pairs.filter(|&pair| is_inlier(&homography, pair, tolerance_px));
+        let moments = InlierMoments::of_inliers(inliers, &homography);
+        let view = moments.view(&homography);
+        view.is_plausible(f64::from(tolerance_px))
+            .then_some(Estimate {
+                homography,
+                inliers: moments.count(),
+                view,
+            })
     }
 }
 
@@ -204,6 +218,9 @@ impl<'a> Search<'a> {
             return;
         }
         let homography = hypothesis.map(f64::from);
+        if !self.may_be_seen(&homography, count) {
+            return;
+        }
         self.take(homography, count);
         let scale = homography[8];
         if scale > 0.0 {
@@ -227,10 +244,22 @@ impl<'a> Search<'a> {
             homography = refined;
             let rounded = homography.map(|entry| entry as f32);
             let count = homography::count_inliers(self.simd, self.points, &rounded, self.best);
-            if count > self.best {
+            if count > self.best && self.may_be_seen(&homography, count) {
                 self.take(homography, count);
             }
         }
+    }
+
+    /// Whether a camera can cause a homography with so many inliers, as far as that is examined now.
+    fn may_be_seen(&mut self, homography: &[f64; 9], count: usize) -> bool {
+        if count < EXAMINED_FROM {
+            return true;
+        }
+        self.scored += COST_OF_EXAMINING;
+        let rounded = homography.map(|entry| entry as f32);
+        let moments = InlierMoments::of_points(self.points, &rounded);
+        // The points are normalised.
+        moments.view(homography).is_plausible(1.0)
     }
 
     /// Number of samples among which one has inliers only, with the required confidence, if the
