@@ -117,7 +117,7 @@ client-test: model ## The Python client: types, wheel, tests and examples agains
 	BIN=$(DEBUG_BIN) clients/python/check.sh
 
 .PHONY: console-test
-console-test: model ## The console in a headless Chromium (CI installs it, others must)
+console-test: model ## The console in a headless Chromium
 	BIN=$(DEBUG_BIN) tests/console/run.sh
 
 .PHONY: compose

@@ -5,10 +5,10 @@
 #   BIN=path/to/placeformer   the program to test against
 #   VENV=dir                  Python environment (default: .venv-tests)
 set -euo pipefail
-cd "$(dirname "${BASH_SOURCE[0]}")"
-root=$(cd ../.. && pwd)
 PLACEFORMER="$(realpath "${BIN:?names the program to test against}")"
 export PLACEFORMER
+cd "$(dirname "${BASH_SOURCE[0]}")"
+root=$(cd ../.. && pwd)
 venv="$("$root/tests/python_env.sh")"
 export PATH="$venv/bin:$PATH" PYTHONDONTWRITEBYTECODE=1
 

@@ -6,10 +6,10 @@
 #   CHROMIUM=path             the browser (default: chromium; root gets Debian's package)
 #   VENV=dir                  Python environment (default: .venv-tests)
 set -euo pipefail
-cd "$(dirname "${BASH_SOURCE[0]}")"
-root=$(cd ../.. && pwd)
 PLACEFORMER="$(realpath "${BIN:?names the program to test}")"
 export PLACEFORMER
+cd "$(dirname "${BASH_SOURCE[0]}")"
+root=$(cd ../.. && pwd)
 
 if [ -z "${CHROMIUM:-}" ] && ! command -v chromium >/dev/null; then
   # In a container, which is where CI and root are, the package can be added.

@@ -85,7 +85,7 @@ class InvalidRequest(ApiError):
 
 
 class ImageRefused(ApiError):
-    """The image is empty, too large, of an unknown type, or damaged."""
+    """The image is empty, too large, of an unknown type, damaged, or shows nothing."""
 
 
 class NotAuthorised(ApiError):
@@ -118,6 +118,7 @@ ERROR_CLASSES: Final[dict[str, type[ApiError]]] = {
     "empty_image": ImageRefused,
     "image_too_large": ImageRefused,
     "image_undecodable": ImageRefused,
+    "image_uninformative": ImageRefused,
     "unsupported_media_type": ImageRefused,
     "unauthorized": NotAuthorised,
     "forbidden": NotAuthorised,

@@ -90,6 +90,7 @@ class QueryAnswer(msgspec.Struct, frozen=True, kw_only=True):
     reranked: bool
     matched: bool | None = None
     confidence: float | None = None
+    unmatched_reason: str | None = None
     timings_ms: dict[str, float]
     model: str
 

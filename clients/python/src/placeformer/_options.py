@@ -34,6 +34,8 @@ class NewReferenceOptions(ReferenceFields, total=False):
 
     exif: bool | None
     """Whether position, heading and time may come from the photo's EXIF and XMP; they do."""
+    allow_uninformative: bool | None
+    """Whether a photo that shows nothing to know a place by is stored all the same."""
 
 
 class QueryOptions(TypedDict, total=False):
