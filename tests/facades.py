@@ -26,6 +26,11 @@ def facade(seed: int, width: int = 320, height: int = 240) -> bytes:
     return png(width, height, rows)
 
 
+def flat(colour: tuple[int, int, int], width: int = 320, height: int = 240) -> bytes:
+    """A PNG of one colour."""
+    return png(width, height, [bytes(colour) * width] * height)
+
+
 def png(width: int, height: int, rows: Iterable[bytes | bytearray]) -> bytes:
     """An RGB PNG of rows of pixels."""
 

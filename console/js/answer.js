@@ -82,6 +82,9 @@ export function verdictOf({ answer, error }) {
   if (answer.matched === null) {
     return ["not calibrated", "unsure"];
   }
+  if (answer.unmatched_reason === "image_uninformative") {
+    return ["shows nothing", "unsure"];
+  }
   const confidence = format.percent(answer.confidence, 1);
   return answer.matched ? [`found, ${confidence}`, "good"] : [`not sure, ${confidence}`, "unsure"];
 }
@@ -101,6 +104,12 @@ function explanation({ answer, map }) {
   const best = answer.results[0];
   if (!best) {
     return null;
+  }
+  if (answer.unmatched_reason === "image_uninformative") {
+    const text =
+      "The photo shows nothing by which a place could be known: it is dark or blank, or the lens " +
+      "is covered. So no place is trusted, whatever agrees.";
+    return element("p", { id: "explanation" }, text);
   }
   const evidence = answer.reranked
     ? `${format.plural(best.spatial_score ?? 0, "pair")} of patches agree on how the two photos ` +

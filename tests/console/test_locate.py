@@ -10,7 +10,7 @@ from pathlib import Path
 from playwright.sync_api import Page, expect
 
 from conftest import add_fronts, front_files
-from facades import facade
+from facades import facade, flat
 from live_server import Server
 from placeformer import Client
 
@@ -63,6 +63,16 @@ def test_a_dropped_photo_is_answered_with_its_place_and_the_evidence(
     assert sum(inliers) == answer.best.spatial_score
     expect(page.locator("#pair")).to_have_attribute("aria-label", re.compile(r"\d+ pairs agree"))
     expect(page.locator("#stages-of-answer")).to_contain_text("extract")
+
+
+def test_a_photo_that_shows_nothing_is_told_so(
+    server: Server, client: Client, map_name: str, open_page: OpenPage
+) -> None:
+    add_fronts(client, map_name, 2)
+    page = open_page(server, map_name)
+    drop(page, "#locate-drop", [("covered.png", flat((12, 12, 14)))])
+    expect(page.locator(".verdict")).to_contain_text("shows nothing")
+    expect(page.locator("#explanation")).to_contain_text("the lens is covered")
 
 
 def test_what_is_drawn_can_be_chosen(
