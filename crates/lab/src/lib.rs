@@ -17,3 +17,6 @@ pub mod draw;
 pub mod eval;
 pub mod synth;
 pub mod train;
+
+// Named for a feature of it that candle's products gain from; see the workspace's manifest.
+use gemm as _;
