@@ -78,8 +78,8 @@ pub struct ReferenceParams {
     )]
     #[serde(default)]
     pub captured_at: Option<Timestamp>,
-    /// Anything else, as a JSON object; numbers and the order of keys come back as they came. No key
-    /// may occur twice in an object.
+    /// Anything else, as a JSON object; numbers and the order of keys come back as they came. No
+    /// key may occur twice in an object.
     #[schema(value_type = Option<Object>)]
     #[param(value_type = Option<String>, example = "{\"camera\":\"left\"}")]
     #[serde(default, deserialize_with = "metadata")]
@@ -89,9 +89,9 @@ pub struct ReferenceParams {
     #[schema(default = true)]
     #[param(example = true)]
     pub exif: Option<bool>,
-    /// Whether a photo is stored that shows nothing by which a place could be known: a dark or blank
-    /// frame, a covered lens. By default it is refused (`image_uninformative`), because every other
-    /// such frame would be found there.
+    /// Whether a photo is stored that shows nothing by which a place could be known: a dark or
+    /// blank frame, a covered lens. By default it is refused (`image_uninformative`), because
+    /// every other such frame would be found there.
     #[schema(default = false)]
     #[param(example = false)]
     pub allow_uninformative: Option<bool>,

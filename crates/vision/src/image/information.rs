@@ -1,16 +1,16 @@
 //! Whether an image shows anything by which a place could be known.
 //!
-//! A black frame, a covered lens or a blank wall has no patches of its own, but a descriptor all the
-//! same: one that resembles that of every other such frame. Stored, it attracts all of them; asked
-//! for, it gets a confident answer that means nothing. So images are measured before they are
-//! described.
+//! A black frame, a covered lens or a blank wall has no patches of its own, but a descriptor all
+//! the same: one that resembles that of every other such frame. Stored, it attracts all of them;
+//! asked for, it gets a confident answer that means nothing. So images are measured before they
+//! are described.
 //!
 //! The measure looks for detail: places where brightness does not change evenly. The image is
 //! averaged in a fixed grid of boxes, which removes the noise of a sensor. Where the mean of a box
 //! differs from what its two neighbours in a row or column would lead to, there is detail; an even
-//! gradient, such as a vignette's, has none. Detail counts only where nearly all boxes around have it
-//! too, so that lines and grains count for nothing. This takes one pass over the pixels that the
-//! model sees, whatever the size of the photo.
+//! gradient, such as a vignette's, has none. Detail counts only where nearly all boxes around have
+//! it too, so that lines and grains count for nothing. This takes one pass over the pixels that
+//! the model sees, whatever the size of the photo.
 
 use super::resize::{DEVIATION, MEAN};
 use placeformer_core::types::ImageTensor;

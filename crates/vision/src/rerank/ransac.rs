@@ -1,12 +1,13 @@
 //! The homography that most correspondences agree with (paper III-D, step 7): RANSAC with local
 //! optimisation.
 //!
-//! Four correspondences determine a homography. Random samples of four are drawn and screened; from
-//! those that pass, homographies are computed, and the correspondences that agree with each are
-//! counted. Whenever one beats the best so far, a least-squares fit on the correspondences near it
-//! tries to gain more. A homography that no camera can cause ([`View`]) does not count, however many
-//! inliers it has. The search stops when a sample without outliers would have been drawn with the
-//! required confidence, if the best share of inliers found so far were the true one.
+//! Four correspondences determine a homography. Random samples of four are drawn and screened;
+//! from those that pass, homographies are computed, and the correspondences that agree with each
+//! are counted. Whenever one beats the best so far, a least-squares fit on the correspondences
+//! near it tries to gain more. A homography that no camera can cause ([`View`]) does not count,
+//! however many inliers it has. The search stops when a sample without outliers would have been
+//! drawn with the required confidence, if the best share of inliers found so far were the true
+//! one.
 //!
 //! Correspondences are sorted, and the random generator is seeded from their coordinates. So the
 //! result depends on the correspondences alone: not on their order, on time, threads, or the
@@ -250,7 +251,8 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Whether a camera can cause a homography with so many inliers, as far as that is examined now.
+    /// Whether a camera can cause a homography with so many inliers, as far as that is examined
+    /// now.
     fn may_be_seen(&mut self, homography: &[f64; 9], count: usize) -> bool {
         if count < EXAMINED_FROM {
             return true;

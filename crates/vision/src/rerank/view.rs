@@ -1,11 +1,11 @@
 //! Which homographies can relate two photos of one place, and how the inliers of one lie.
 //!
-//! A homography has eight degrees of freedom, enough to bend two unrelated photos onto each other: it
-//! can squeeze one into a line, fold it at the horizon, or stretch a row of patches over another row.
-//! Such a homography has many inliers and says nothing about the place. A camera that sees the same
-//! facades again does not see them mirrored, a hundred times as large, or as a line. So the
-//! homography is looked at where its inliers are, and so are the inliers: all on a thin line, as
-//! along a kerb or a wire, they would agree with almost anything.
+//! A homography has eight degrees of freedom, enough to bend two unrelated photos onto each other:
+//! it can squeeze one into a line, fold it at the horizon, or stretch a row of patches over
+//! another row. Such a homography has many inliers and says nothing about the place. A camera that
+//! sees the same facades again does not see them mirrored, a hundred times as large, or as a line.
+//! So the homography is looked at where its inliers are, and so are the inliers: all on a thin
+//! line, as along a kerb or a wire, they would agree with almost anything.
 
 use placeformer_kernels::homography::PointPairs;
 
@@ -190,8 +190,8 @@ pub(super) struct View {
 }
 
 impl View {
-    /// Whether a camera that sees a place again can see it so. `tolerance` is that of the inliers, in
-    /// the unit of the spread.
+    /// Whether a camera that sees a place again can see it so. `tolerance` is that of the inliers,
+    /// in the unit of the spread.
     pub(super) fn is_plausible(&self, tolerance: f64) -> bool {
         let spread = self.spread.iter().all(|&it| it >= LEAST_SPREAD * tolerance);
         let scale = (1.0 / LARGEST_SCALE..=LARGEST_SCALE).contains(&self.scale);
