@@ -24,8 +24,8 @@ pub struct IngestRequest {
     pub fields: ReferenceFields,
     /// The photo, as it was sent.
     pub image: Bytes,
-    /// Whether position, heading and time are taken from the photo's EXIF and XMP where `fields`
-    /// has none.
+    /// Whether position, height, heading and time are taken from the photo's EXIF and XMP where
+    /// `fields` has none.
     pub reads_photo: bool,
 }
 
@@ -47,6 +47,8 @@ pub enum FieldSource {
 pub struct FieldSources {
     /// The location.
     pub location: Option<FieldSource>,
+    /// The height.
+    pub alt: Option<FieldSource>,
     /// The heading.
     pub heading: Option<FieldSource>,
     /// The time.
@@ -58,6 +60,7 @@ impl FieldSources {
     fn stored(fields: &ReferenceFields) -> Self {
         Self {
             location: fields.location.map(|_| FieldSource::Stored),
+            alt: fields.alt.map(|_| FieldSource::Stored),
             heading: fields.heading.map(|_| FieldSource::Stored),
             captured_at: fields.captured_at.map(|_| FieldSource::Stored),
         }
@@ -68,6 +71,7 @@ impl FieldSources {
         let sources = photo.sources;
         Self {
             location: fill(&mut fields.location, photo.location, sources.location),
+            alt: fill(&mut fields.alt, photo.alt, sources.alt),
             heading: fill(&mut fields.heading, photo.heading, sources.heading),
             captured_at: fill(
                 &mut fields.captured_at,
@@ -284,6 +288,8 @@ impl Service {
                 id: reference.id,
                 global,
                 location: reference.fields.location,
+                alt: reference.fields.alt,
+                heading: reference.fields.heading,
                 captured_at: reference.fields.captured_at,
             });
         }
