@@ -94,7 +94,18 @@ fn print_answer(answer: &Value) -> Result<(), OutputError> {
         let trust = if matched { "trusted" } else { "not trusted" };
         say!("the best answer is {trust}: confidence {confidence:.3}")?;
     }
+    print_estimate(&answer["estimate"])?;
     print_timings(answer)
+}
+
+fn print_estimate(estimate: &Value) -> Result<(), OutputError> {
+    let number = |field: &str| estimate[field].as_f64();
+    if let (Some(lat), Some(lon), Some(accuracy)) =
+        (number("lat"), number("lon"), number("accuracy_m"))
+    {
+        say!("the photo was taken at {lat:.6},{lon:.6} within {accuracy:.0} m")?;
+    }
+    Ok(())
 }
 
 fn print_result(result: &Value) -> Result<(), OutputError> {

@@ -71,9 +71,26 @@ impl Calibrations {
         }
     }
 
+    /// Whether an answer that is right with this `probability` is trusted.
+    pub(super) fn judge(
+        &self,
+        model: &ModelId,
+        own: Option<&Calibration>,
+        reranked: bool,
+        probability: f64,
+    ) -> MatchConfidence {
+        match self.curve(model, own, reranked) {
+            Some(curve) => MatchConfidence {
+                matched: Some(curve.trusts(probability)),
+                confidence: Some(probability),
+            },
+            None => MatchConfidence::default(),
+        }
+    }
+
     /// The curve in force: the map's own before the model's. A curve of scores holds only for the
     /// re-ranking it was fitted on; a curve of distances holds for any.
-    fn curve<'a>(
+    pub(super) fn curve<'a>(
         &'a self,
         model: &ModelId,
         own: Option<&'a Calibration>,

@@ -31,3 +31,4 @@ mod routes;
 mod slow_clients;
 mod surface;
 mod tls;
+mod tracks;

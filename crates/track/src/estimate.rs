@@ -9,7 +9,7 @@
 
 use crate::filter::PLACE_RADIUS_M;
 use crate::ground::Point;
-use placeformer_core::types::{GeoPoint, Heading};
+use placeformer_core::types::{Altitude, GeoPoint, Heading};
 
 /// Standard deviation in metres, on each axis, of a vehicle around the one reference it is at.
 const SPOT_SIGMA_M: f64 = 5.0;
@@ -34,6 +34,8 @@ pub struct Sight {
     pub point: GeoPoint,
     /// Where that reference's camera looked, if it is known.
     pub heading: Option<Heading>,
+    /// How high it was taken, if that is known.
+    pub alt: Option<Altitude>,
     /// Its probability.
     pub weight: f64,
 }
@@ -43,6 +45,8 @@ pub struct Sight {
 pub struct Estimate {
     /// Where it is.
     pub point: GeoPoint,
+    /// How high it is, if the references say how high they are.
+    pub alt: Option<Altitude>,
     /// Where its camera looks, if the references say where theirs did.
     pub heading: Option<Heading>,
     /// Radius in metres that holds the true position with a probability of 68 %.
@@ -68,6 +72,7 @@ pub fn estimate(best: GeoPoint, sights: &[Sight]) -> Option<Estimate> {
     let [east, _, _, north] = covariance;
     Some(Estimate {
         point: moved(best, mean)?,
+        alt: mean_altitude(&near),
         heading,
         accuracy_m: (SQUARED_RADIUS_SHARE * (east + north)).sqrt(),
         accuracy_deg,
@@ -97,6 +102,18 @@ fn spread(centre: GeoPoint, near: &[&Sight], total: f64) -> ([f64; 2], [f64; 4])
     }
     covariance[2] = covariance[1];
     (mean, covariance)
+}
+
+/// The mean height of the places that say theirs.
+fn mean_altitude(near: &[&Sight]) -> Option<Altitude> {
+    let (mut sum, mut total) = (0.0, 0.0);
+    for sight in near {
+        if let Some(alt) = sight.alt {
+            sum += sight.weight * alt.metres();
+            total += sight.weight;
+        }
+    }
+    Altitude::new(sum / total).ok()
 }
 
 /// The mean direction of the headings, and degrees to each side that hold 68 %.
@@ -150,6 +167,7 @@ mod tests {
         Sight {
             point: GeoPoint::new(lat, lon).unwrap(),
             heading: heading.map(|degrees| Heading::new(degrees).unwrap()),
+            alt: None,
             weight,
         }
     }
@@ -185,6 +203,19 @@ mod tests {
     }
 
     #[test]
+    fn heights_are_averaged_over_the_places_that_say_theirs() {
+        let at = |alt: Option<f64>, weight| Sight {
+            alt: alt.map(|metres| Altitude::new(metres).unwrap()),
+            ..sight(51.0, 7.0, None, weight)
+        };
+        let sights = [at(Some(100.0), 0.6), at(Some(110.0), 0.2), at(None, 0.2)];
+        let found = estimate(sights[0].point, &sights).unwrap();
+        assert!((found.alt.unwrap().metres() - 102.5).abs() < 1e-9);
+        let silent = [at(None, 1.0)];
+        assert_eq!(estimate(silent[0].point, &silent).unwrap().alt, None);
+    }
+
+    #[test]
     fn the_date_line_is_no_border() {
         let sights = [
             sight(0.0, 179.99995, None, 1.0),
@@ -199,10 +230,11 @@ mod tests {
         #[test]
         fn estimates_are_finite_and_among_their_places(
             lat in -90.0..90.0f64, lon in -180.0..180.0f64,
-            raw in prop::collection::vec((-2e-4..2e-4f64, -2e-4..2e-4f64, 0.0..360.0f64, 1e-9..1.0f64), 1..20),
+            raw in prop::collection::vec(
+                (-2e-4..2e-4f64, -2e-4..2e-4f64, 0.0..360.0f64, 1e-9..1.0f64), 1..20),
         ) {
             let best = GeoPoint::new(lat, lon).unwrap();
-            let mut sights = vec![Sight { point: best, heading: None, weight: 1e-3 }];
+            let mut sights = vec![Sight { point: best, heading: None, alt: None, weight: 1e-3 }];
             for (north, east, heading, weight) in raw {
                 let lon = (lon + east + 180.0).rem_euclid(360.0) - 180.0;
                 sights.push(sight((lat + north).clamp(-90.0, 90.0), lon, Some(heading), weight));

@@ -57,6 +57,14 @@ impl TrackKey {
         Self(hmac::Key::new(HMAC_SHA256, bytes))
     }
 
+    /// A key that nobody else has: for a process whose tokens nobody keeps.
+    ///
+    /// # Errors
+    /// The system has no random bytes.
+    pub fn random() -> Result<Self, KeyError> {
+        Ok(Self::new(&random_bytes()?))
+    }
+
     /// The key in a file.
     ///
     /// # Errors
@@ -88,10 +96,7 @@ impl TrackKey {
             Err(KeyError::File { source, .. }) if source.kind() == ErrorKind::NotFound => {}
             found => return found,
         }
-        let mut bytes = [0; KEY_BYTES];
-        SystemRandom::new()
-            .fill(&mut bytes)
-            .map_err(|_| KeyError::NoRandomness)?;
+        let bytes = random_bytes()?;
         let text = to_hex(&bytes) + "\n";
         write_secret_atomically(path, text.as_bytes()).map_err(|source| KeyError::File {
             path: path.to_owned(),
@@ -109,6 +114,13 @@ impl TrackKey {
     pub(crate) fn verifies(&self, message: &[u8], tag: &[u8]) -> bool {
         hmac::verify(&self.0, message, tag).is_ok()
     }
+}
+
+fn random_bytes() -> Result<[u8; KEY_BYTES], KeyError> {
+    let mut bytes = [0; KEY_BYTES];
+    let filled = SystemRandom::new().fill(&mut bytes);
+    filled.map_err(|_| KeyError::NoRandomness)?;
+    Ok(bytes)
 }
 
 fn to_hex(bytes: &[u8]) -> String {

@@ -14,6 +14,7 @@
 //! | `ground` | positions in metres |
 //! | `motion` | how likely a vehicle came from one place to another |
 //! | `filter` | belief, prediction and posterior |
+//! | `step` | one frame: what is expected, what is believed after |
 //! | `evidence` | what a photo says about a place, from calibrated scores |
 //! | `estimate` | position and heading with their accuracy, from weighted places |
 //! | `token`, `key` | a track on its way: written, authenticated, read |
@@ -24,6 +25,7 @@ mod filter;
 mod ground;
 mod key;
 mod motion;
+mod step;
 mod token;
 
 pub use estimate::{Estimate, Sight, estimate};
@@ -32,4 +34,5 @@ pub use filter::{Belief, FilterSettings, PLACE_RADIUS_M, Posterior, Prediction, 
 pub use ground::{Place, Point};
 pub use key::{KEY_BYTES, KeyError, TrackKey};
 pub use motion::{Motion, Travel, Turn};
+pub use step::{Expectation, Whereabouts};
 pub use token::{Believed, LONGEST_TOKEN, MOST_PLACES, TokenError, Track};

@@ -80,6 +80,12 @@ pub struct Motion {
 }
 
 impl Motion {
+    /// No motion at all, as before the first frame.
+    pub const STILL: Self = Self {
+        travel: Travel::Within { reach_m: 0.0 },
+        turn: None,
+    };
+
     /// Checks the travel.
     ///
     /// # Errors

@@ -7,7 +7,8 @@
 //!
 //! ```text
 //! version u8 | length u16 | issued_at i64 | clock u8, captured_at i64 | frames u32
-//!   | map u8 + bytes | model u16 + bytes | elsewhere f32 | places u16 x (id 16 bytes, f32) | tag 32
+//!   | map u8 + bytes | model u16 + bytes | elsewhere f32
+//!   | places u16 x (id 16 bytes, f32) | tag 32 bytes
 //! ```
 //!
 //! Numbers are little-endian and times are microseconds since 1970. The text is base64url without
