@@ -26,6 +26,7 @@
 //! | `placeformer-core` | types, the one table of error codes, durable files, geography |
 //! | `placeformer-kernels` | SIMD inner loops with scalar twins; the only `unsafe` code |
 //! | `placeformer-vision` | the stages `image`, `extract`, `search` and `rerank`: pure computation |
+//! | `placeformer-track` | where a vehicle is, from one photo after another, and its token |
 //! | `placeformer-models` | where the weights of a preset come from |
 //! | `placeformer-store` | references and their descriptors on disk |
 //! | `placeformer-lab` | data sets, evaluation, training, drawn streets, benchmarks |

@@ -13,6 +13,7 @@ use placeformer_core::progress::Progress;
 use placeformer_core::types::InvalidValue;
 use placeformer_models::open_extractor;
 use placeformer_store::{LostTail, PlaceStore, SqliteStore, StoreConfig, StoreError};
+use placeformer_track::{KeyError, TrackKey};
 use placeformer_vision::extract::ExtractConfig;
 use std::error::Error;
 use std::future::Future;
@@ -32,6 +33,9 @@ const DISK_ANSWER_LIMIT: Duration = Duration::from_secs(20);
 
 /// How long blocking work may go on after the last request was answered.
 const BLOCKING_GRACE: Duration = Duration::from_secs(5);
+
+/// The key of tracks in the data directory.
+const TRACK_KEY_FILE: &str = "track.key";
 
 /// The error of a loader.
 pub type LoadError = Box<dyn Error + Send + Sync>;
@@ -87,6 +91,9 @@ pub enum ServerError {
     /// The store cannot be opened.
     #[error(transparent)]
     Store(LoadError),
+    /// There is no key for the tokens of tracks.
+    #[error(transparent)]
+    TrackKey(#[from] KeyError),
     /// The pipeline cannot start on the model and the store.
     #[error(transparent)]
     Pipeline(#[from] PipelineError),
@@ -277,16 +284,27 @@ fn start_service(
     let source = (loaders.source)().map_err(ServerError::Model)?;
     health.migrating();
     let store = (loaders.store)().map_err(ServerError::Store)?;
+    let track_key = open_track_key(&config)?;
     let service = Service::start(Parts {
         store,
         source,
         image: config.image,
         rerank: config.rerank,
         pipeline: config.pipeline,
+        tracks: config.tracks,
+        track_key,
         metrics,
         health,
     })?;
     Ok(service)
+}
+
+/// The key of tracks: the one in the settings, or else this node's own, next to its store.
+fn open_track_key(config: &Config) -> Result<TrackKey, KeyError> {
+    match &config.tracks.key_file {
+        Some(path) => TrackKey::read(path),
+        None => TrackKey::read_or_create(&config.data.directory.join(TRACK_KEY_FILE)),
+    }
 }
 
 /// Reads the keys again whenever there is a reason to, for as long as the result lives. Settings

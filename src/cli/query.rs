@@ -97,7 +97,18 @@ fn print_answer(answer: &Value) -> Result<(), OutputError> {
     if answer["unmatched_reason"] == "image_uninformative" {
         say!("the photo shows nothing to know a place by")?;
     }
+    print_estimate(&answer["estimate"])?;
     print_timings(answer)
+}
+
+fn print_estimate(estimate: &Value) -> Result<(), OutputError> {
+    let number = |field: &str| estimate[field].as_f64();
+    if let (Some(lat), Some(lon), Some(accuracy)) =
+        (number("lat"), number("lon"), number("accuracy_m"))
+    {
+        say!("the photo was taken at {lat:.6},{lon:.6} within {accuracy:.0} m")?;
+    }
+    Ok(())
 }
 
 fn print_result(result: &Value) -> Result<(), OutputError> {

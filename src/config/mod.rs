@@ -20,7 +20,7 @@ pub use overrides::{ModelOverrides, Overrides};
 
 use crate::http::{AuthConfig, HttpConfig};
 use crate::ops::LogConfig;
-use crate::pipeline::PipelineConfig;
+use crate::pipeline::{PipelineConfig, TrackConfig};
 use placeformer_core::types::InvalidValue;
 use placeformer_store::StoreConfig;
 use placeformer_vision::extract::{ExtractConfig, HeadChoice};
@@ -50,6 +50,8 @@ pub struct Config {
     pub store: StoreConfig,
     /// Queues, cache, defaults and bounds of queries, limits of memory and disk.
     pub pipeline: PipelineConfig,
+    /// Queries that continue one another, as a vehicle's frames do.
+    pub tracks: TrackConfig,
     /// Limits of images, checked before they are decoded.
     pub image: ImageConfig,
     /// The model, and how an image becomes a descriptor.
@@ -171,6 +173,7 @@ impl Config {
         self.http.check().map_err(broken)?;
         self.auth.check().map_err(broken)?;
         self.pipeline.check().map_err(broken)?;
+        self.tracks.check().map_err(broken)?;
         self.image.check().map_err(broken)?;
         self.store.check().map_err(broken)?;
         self.rerank.check().map_err(broken)?;

@@ -106,7 +106,7 @@ pub(super) fn calibration() -> Value {
 }
 
 fn location() -> Value {
-    json!({"lat": 51.5072, "lon": -0.1276, "heading": 270.0})
+    json!({"lat": 51.5072, "lon": -0.1276, "alt": 83.5, "heading": 270.0})
 }
 
 /// A body of `POST /references`.
@@ -117,6 +117,7 @@ pub(super) fn new_reference() -> Value {
         "external_id": "drive7/000123.jpg",
         "lat": 51.5072,
         "lon": -0.1276,
+        "alt": 83.5,
         "heading": 270,
         "captured_at": "2026-05-17T09:30:00Z",
         "metadata": {"camera": "left"},
@@ -188,6 +189,21 @@ pub(super) fn query_answer() -> Value {
         "matched": true,
         "confidence": 0.996,
         "unmatched_reason": null,
+        "estimate": {
+            "lat": 51.50721,
+            "lon": -0.12758,
+            "alt": 83.4,
+            "heading": 268.9,
+            "accuracy_m": 7.8,
+            "accuracy_deg": 8.2,
+            "horizontal_covariance": [27.1, 0.4, 0.4, 26.3],
+        },
+        "track": {
+            "token": "AWMAQB1bHSlCBgABQB1bHSlCBgARAAAAB2hhcmJvdXI",
+            "probability": 0.996,
+            "lost": false,
+            "frames": 17,
+        },
         "timings_ms": {
             "decode": 6.1,
             "queue": 0.4,

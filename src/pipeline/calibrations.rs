@@ -94,9 +94,30 @@ impl Calibrations {
         }
     }
 
+    /// Whether an answer that is right with this `probability` is trusted.
+    pub(super) fn judge(
+        &self,
+        model: &ModelId,
+        own: Option<&Calibration>,
+        reranked: bool,
+        probability: f64,
+    ) -> MatchConfidence {
+        match self.curve(model, own, reranked) {
+            Some(curve) => {
+                let matched = curve.trusts(probability);
+                MatchConfidence {
+                    matched: Some(matched),
+                    confidence: Some(probability),
+                    reason: (!matched).then_some(UnmatchedReason::LowConfidence),
+                }
+            }
+            None => MatchConfidence::default(),
+        }
+    }
+
     /// The curve in force: the map's own before the model's. A curve of scores holds only for the
     /// re-ranking it was fitted on; a curve of distances holds for any.
-    fn curve<'a>(
+    pub(super) fn curve<'a>(
         &'a self,
         model: &ModelId,
         own: Option<&'a Calibration>,

@@ -1,6 +1,6 @@
 //! Changing and deleting references and maps, in the store and in the index together.
 
-use super::maps::Change;
+use super::maps::{Change, Moved};
 use super::{Caller, PipelineError, Service};
 use placeformer_core::types::{Calibration, MapName, Reference, ReferenceId};
 use placeformer_store::{ReferencePatch, StoreError};
@@ -71,14 +71,21 @@ impl Service {
         id: ReferenceId,
         patch: ReferencePatch,
     ) -> Result<Reference, PipelineError> {
-        let changes_index = patch.location.is_some() || patch.captured_at.is_some();
+        let changes_index = patch.location.is_some()
+            || patch.alt.is_some()
+            || patch.heading.is_some()
+            || patch.captured_at.is_some();
         let entry = self.maps.entry(&self.store.get(id)?.map);
         let _changing = entry.lock_for_change();
         let reference = self.store.update(id, patch)?;
         if changes_index {
-            let location = reference.fields.location;
-            let captured_at = reference.fields.captured_at;
-            let change = Change::Moved(id, location, captured_at);
+            let change = Change::Moved(Moved {
+                id,
+                location: reference.fields.location,
+                alt: reference.fields.alt,
+                heading: reference.fields.heading,
+                captured_at: reference.fields.captured_at,
+            });
             if let Some(live) = entry.live() {
                 change.apply(&live.index);
             }

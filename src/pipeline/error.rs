@@ -1,5 +1,6 @@
 //! Why a request through the pipeline failed.
 
+use super::tracks::FrameError;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{ExternalId, InvalidValue, MapName, ModelId, RerankId};
 use placeformer_store::StoreError;
@@ -65,6 +66,17 @@ pub enum PipelineError {
         /// What the calibration was fitted on.
         given: RerankId,
     },
+    /// A query is one of a track, and the map does not allow that.
+    #[error("map {map} cannot be tracked in: {reason}")]
+    TrackUnavailable {
+        /// The map.
+        map: MapName,
+        /// Why not.
+        reason: &'static str,
+    },
+    /// A frame of a track is refused.
+    #[error(transparent)]
+    Frame(#[from] FrameError),
     /// The external id already names another image.
     #[error("external id {external_id} of map {map} belongs to another image")]
     ExternalIdConflict {
@@ -127,6 +139,9 @@ impl PipelineError {
             Self::HeadUnreadable(_) => ErrorCode::HeadUnreadable,
             Self::HeadMismatch { .. } => ErrorCode::HeadMismatch,
             Self::RerankMismatch { .. } => ErrorCode::CalibrationMismatch,
+            Self::TrackUnavailable { .. } => ErrorCode::TrackUnavailable,
+            Self::Frame(FrameError::Token(error)) => error.code(),
+            Self::Frame(FrameError::Invalid(_)) => ErrorCode::InvalidParameter,
             Self::ExternalIdConflict { .. } => ErrorCode::ExternalIdConflict,
             Self::Overloaded { .. } | Self::StoreBusy => ErrorCode::Overloaded,
             Self::MemoryPressure(_) => ErrorCode::MemoryPressure,

@@ -24,8 +24,8 @@ pub struct IngestRequest {
     pub fields: ReferenceFields,
     /// The photo, as it was sent.
     pub image: Bytes,
-    /// Whether position, heading and time are taken from the photo's EXIF and XMP where `fields`
-    /// has none.
+    /// Whether position, height, heading and time are taken from the photo's EXIF and XMP where
+    /// `fields` has none.
     pub reads_photo: bool,
     /// Whether it is stored although it shows nothing by which a place could be known.
     pub allow_uninformative: bool,
@@ -49,6 +49,8 @@ pub enum FieldSource {
 pub struct FieldSources {
     /// The location.
     pub location: Option<FieldSource>,
+    /// The height.
+    pub alt: Option<FieldSource>,
     /// The heading.
     pub heading: Option<FieldSource>,
     /// The time.
@@ -60,6 +62,7 @@ impl FieldSources {
     fn stored(fields: &ReferenceFields) -> Self {
         Self {
             location: fields.location.map(|_| FieldSource::Stored),
+            alt: fields.alt.map(|_| FieldSource::Stored),
             heading: fields.heading.map(|_| FieldSource::Stored),
             captured_at: fields.captured_at.map(|_| FieldSource::Stored),
         }
@@ -70,6 +73,7 @@ impl FieldSources {
         let sources = photo.sources;
         Self {
             location: fill(&mut fields.location, photo.location, sources.location),
+            alt: fill(&mut fields.alt, photo.alt, sources.alt),
             heading: fill(&mut fields.heading, photo.heading, sources.heading),
             captured_at: fill(
                 &mut fields.captured_at,
@@ -290,6 +294,8 @@ impl Service {
                 id: reference.id,
                 global,
                 location: reference.fields.location,
+                alt: reference.fields.alt,
+                heading: reference.fields.heading,
                 captured_at: reference.fields.captured_at,
             });
         }

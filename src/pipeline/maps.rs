@@ -11,7 +11,7 @@
 
 use super::PipelineError;
 use placeformer_core::types::{
-    Calibration, Descriptor, GeoPoint, MapName, ModelId, ReferenceId, Timestamp,
+    Altitude, Calibration, Descriptor, GeoPoint, Heading, MapName, ModelId, ReferenceId, Timestamp,
 };
 use placeformer_store::{GlobalRow, StoreError};
 use placeformer_vision::extract::Head;
@@ -37,10 +37,20 @@ pub(super) struct MapEntry {
 /// A change of an entry of an index.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Change {
-    /// Another location or capture time.
-    Moved(ReferenceId, Option<GeoPoint>, Option<Timestamp>),
+    /// Another location, height, heading or capture time.
+    Moved(Moved),
     /// No longer there.
     Deleted(ReferenceId),
+}
+
+/// Where, in which direction and when a reference was taken, as it is from now on.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Moved {
+    pub(super) id: ReferenceId,
+    pub(super) location: Option<GeoPoint>,
+    pub(super) alt: Option<Altitude>,
+    pub(super) heading: Option<Heading>,
+    pub(super) captured_at: Option<Timestamp>,
 }
 
 /// How the global descriptors of a map are made.
@@ -180,13 +190,15 @@ impl Change {
                 index.remove(id);
             }
             // A damaged reference is not in the index and does not enter it by being moved.
-            Self::Moved(id, location, captured_at) => {
-                if let Some(global) = index.global(id) {
+            Self::Moved(moved) => {
+                if let Some(global) = index.global(moved.id) {
                     index.insert(IndexEntry {
-                        id,
+                        id: moved.id,
                         global,
-                        location,
-                        captured_at,
+                        location: moved.location,
+                        alt: moved.alt,
+                        heading: moved.heading,
+                        captured_at: moved.captured_at,
                     });
                 }
             }
@@ -250,12 +262,16 @@ pub(super) fn index_entry(row: GlobalRow) -> IndexEntry {
         reference,
         global,
         location,
+        alt,
+        heading,
         captured_at,
     } = row;
     IndexEntry {
         id: reference,
         global,
         location,
+        alt,
+        heading,
         captured_at,
     }
 }

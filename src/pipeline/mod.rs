@@ -21,6 +21,7 @@
 //! | `caller`, `fair` | who a request is from; permits for which callers take turns |
 //! | `admission`, `blocking` | bounds on waiting and on threads |
 //! | `maps`, `patches` | index and locks of each map; cache of key patches |
+//! | `tracks` | queries that continue one another |
 //! | `calibrations` | how far the best answer can be trusted |
 
 mod admission;
@@ -42,6 +43,7 @@ mod service;
 mod source;
 mod startup;
 mod timings;
+mod tracks;
 
 pub use calibrations::{MatchConfidence, UnmatchedReason};
 pub use caller::{Caller, network_of};
@@ -54,3 +56,4 @@ pub use service::{Service, ServiceInfo};
 pub use source::DescriptorSource;
 pub use startup::Parts;
 pub use timings::Timings;
+pub use tracks::{FrameError, TrackAnswer, TrackConfig, TrackOptions};

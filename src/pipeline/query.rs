@@ -2,14 +2,19 @@
 //!
 //! 1. The model turns the photo into a global descriptor and key patches (paper III-A to III-C).
 //! 2. Global search: the nearest global descriptors of the map are the candidates (paper III-A).
+//!    What the track of a vehicle expects is added to them.
 //! 3. Re-ranking: key patches of photo and candidates are matched, and a homography counts the
 //!    inliers (paper III-D, III-E). It is left out if the query asks so or has no time left.
-//! 4. The first results get their metadata from the store, and the best one its confidence.
+//! 4. The first results get their metadata from the store, and the best one its confidence. In a
+//!    track both the order and the confidence are those of its filter.
+
+mod track;
 
 use super::blocking::blocking;
 use super::calibrations::BestAnswer;
 use super::extraction::{Described, Purpose};
 use super::maps::LiveMap;
+use super::tracks::{Frame, Sighting, TrackAnswer, TrackOptions};
 use super::{Caller, MatchConfidence, PipelineError, Service, Timings, UnmatchedReason};
 use crate::ops::PipelineStage;
 use bytes::Bytes;
@@ -18,6 +23,7 @@ use placeformer_core::types::{
     Deadline, Descriptor, MapName, ModelId, Reference, ReferenceFilter, ReferenceId,
 };
 use placeformer_store::StoreError;
+use placeformer_track::Estimate;
 use placeformer_vision::rerank::{PairScore, Reranked};
 use placeformer_vision::search::Neighbour;
 use std::collections::HashMap;
@@ -38,6 +44,8 @@ pub struct QueryOptions {
     pub filter: ReferenceFilter,
     /// When the answer must be ready.
     pub deadline: Option<Deadline>,
+    /// What it continues, if it is one of a track.
+    pub track: Option<TrackOptions>,
 }
 
 /// A photo and the map it is looked for in.
@@ -71,6 +79,11 @@ pub struct QueryAnswer {
     pub reranked: bool,
     /// How far the first result can be trusted.
     pub confidence: MatchConfidence,
+    /// Where exactly the photo was taken; `None` if the first result is not trusted or has no
+    /// position.
+    pub estimate: Option<Estimate>,
+    /// The track after this frame, if the query is one of a track.
+    pub track: Option<TrackAnswer>,
     /// Where the time went.
     pub timings: Timings,
     /// What computed it.
@@ -102,6 +115,7 @@ struct QueryPlan {
     rerank: bool,
     filter: ReferenceFilter,
     deadline: Deadline,
+    frame: Option<Frame>,
 }
 
 impl Service {
@@ -166,15 +180,21 @@ impl Service {
         let model = self.extraction.source().model_id();
         let map = self.maps.comparable(&name, model)?;
         let candidates = config.check_count("candidates", candidates)?;
+        let rerank = options.rerank.unwrap_or(true);
+        let frame = match &options.track {
+            Some(track) => Some(self.frame(&name, &map, rerank, track)?),
+            None => None,
+        };
         let default_deadline = || Deadline::after(Duration::from_millis(config.deadline_ms));
         Ok(QueryPlan {
             name,
             map,
             top_k,
             candidates,
-            rerank: options.rerank.unwrap_or(true),
+            rerank,
             filter: options.filter,
             deadline: options.deadline.unwrap_or_else(default_deadline),
+            frame,
         })
     }
 
@@ -194,21 +214,42 @@ impl Service {
         mut timings: Timings,
     ) -> Result<QueryAnswer, PipelineError> {
         let query = &described.descriptor;
-        let neighbours = self.search(plan, query, &mut timings);
-        let reranking = self.rerank(plan, query, &neighbours, &mut timings)?;
+        let global = plan.map.global_of(query);
+        let mut candidates = self.search(plan, &global, &mut timings);
+        let mut beyond = candidates.split_off(candidates.len().min(plan.candidates));
+        let localisation = self.localise(plan, &global, &mut candidates, &mut timings)?;
+        if plan.frame.is_some() {
+            // Some of these may have been added to the candidates.
+            beyond.retain(|one| candidates.iter().all(|candidate| candidate.id != one.id));
+        }
+        let reranking = self.rerank(plan, query, &candidates, &mut timings)?;
         let reranked = reranking.is_some();
-        let ranking = match reranking {
-            Some(ranking) => ranking,
-            None => neighbours
+        let by_distance = || {
+            candidates
                 .iter()
                 .map(RankedNeighbour::by_distance)
-                .collect(),
+                .collect()
         };
+        let mut ranking = reranking.unwrap_or_else(by_distance);
+        let sighting = self.weigh(plan, localisation, &mut ranking, reranked, &mut timings);
+        ranking.extend(beyond.iter().map(RankedNeighbour::by_distance));
 
         let results = self.with_metadata(plan, ranking)?;
-        let shows_nothing = described.lacks.is_some();
-        let confidence = self.confidence(plan, results.first(), reranked, shows_nothing);
+        let best = results.first();
+        let confidence = match described.lacks {
+            Some(_) => MatchConfidence::unmatched(UnmatchedReason::ImageUninformative),
+            None => self.confidence(plan, best, reranked, sighting.as_ref()),
+        };
+        self.count_answer(best, reranked, confidence);
+        let best = best.map(|best| best.reference.id);
+        let pose = || sighting.as_ref()?.pose(best?);
         Ok(QueryAnswer {
+            estimate: if confidence.matched == Some(true) {
+                pose()
+            } else {
+                None
+            },
+            track: self.continue_track(plan, sighting.as_ref(), best)?,
             results,
             reranked,
             confidence,
@@ -218,31 +259,25 @@ impl Service {
     }
 
     /// The references nearest to the query by global descriptor, nearest first.
-    fn search(
-        &self,
-        plan: &QueryPlan,
-        query: &Descriptor,
-        timings: &mut Timings,
-    ) -> Vec<Neighbour> {
+    fn search(&self, plan: &QueryPlan, global: &[f32], timings: &mut Timings) -> Vec<Neighbour> {
         let started = Instant::now();
-        let wanted = if plan.rerank {
+        let wanted = if plan.rerank || plan.frame.is_some() {
             plan.candidates.max(plan.top_k)
         } else {
             plan.top_k
         };
-        let global = plan.map.global_of(query);
-        let neighbours = plan.map.index.search(&global, wanted, &plan.filter);
+        let neighbours = plan.map.index.search(global, wanted, &plan.filter);
         timings.record(&self.metrics, PipelineStage::Search, started.elapsed());
         neighbours
     }
 
-    /// The candidates ordered by spatial score, followed by the neighbours beyond them; `None` if
-    /// the query does not want it or time ran out.
+    /// The candidates ordered by spatial score; `None` if the query does not want it or time ran
+    /// out.
     fn rerank(
         &self,
         plan: &QueryPlan,
         query: &Descriptor,
-        neighbours: &[Neighbour],
+        candidates: &[Neighbour],
         timings: &mut Timings,
     ) -> Result<Option<Vec<RankedNeighbour>>, PipelineError> {
         if !plan.rerank {
@@ -254,7 +289,6 @@ impl Service {
             return Ok(None);
         }
 
-        let (candidates, beyond) = neighbours.split_at(neighbours.len().min(plan.candidates));
         let deadline = Deadline::after(time_left);
         let outcome = self.score_candidates(query, candidates, deadline, timings);
         let Reranked::Complete { ranked, failed } = outcome else {
@@ -275,8 +309,7 @@ impl Service {
             neighbour: candidates[ranked.candidate],
             score: Some(ranked.score),
         });
-        let unscored = beyond.iter().map(RankedNeighbour::by_distance);
-        Ok(Some(scored.chain(unscored).collect()))
+        Ok(Some(scored.collect()))
     }
 
     /// Matches the key patches of the query with those of each candidate, which are loaded from the
@@ -375,30 +408,42 @@ impl Service {
         Ok(results)
     }
 
-    /// How far the best result can be trusted, by the calibration in force; not at all if the photo
-    /// shows nothing by which a place could be known. Counted in the metrics.
+    /// How far the best result can be trusted, by the calibration in force, or in a track by all
+    /// that is known of it.
     fn confidence(
         &self,
         plan: &QueryPlan,
         best: Option<&QueryResult>,
         reranked: bool,
-        shows_nothing: bool,
+        sighting: Option<&Sighting>,
     ) -> MatchConfidence {
+        let of_track = plan.frame.as_ref().and(sighting);
+        let probability = of_track.map(|sighting| {
+            let best = best.map(|best| best.reference.id);
+            sighting.probability(best)
+        });
         let best = best.map(|best| BestAnswer {
             spatial_score: best.score.as_ref().map(|score| score.spatial_score),
             global_distance: best.global_distance,
         });
         let own = plan.map.calibration();
-        let calibrations = &self.calibrations;
-        let confidence = if shows_nothing {
-            MatchConfidence::unmatched(UnmatchedReason::ImageUninformative)
-        } else {
-            calibrations.assess(&plan.map.model, own.as_deref(), best)
-        };
+        let (model, own) = (&plan.map.model, own.as_deref());
+        match probability {
+            Some(probability) => self.calibrations.judge(model, own, reranked, probability),
+            None => self.calibrations.assess(model, own, best),
+        }
+    }
 
-        let spatial_score = best.and_then(|best| best.spatial_score).unwrap_or(0);
+    /// Counts an answer with its best result in the metrics.
+    fn count_answer(
+        &self,
+        best: Option<&QueryResult>,
+        reranked: bool,
+        confidence: MatchConfidence,
+    ) {
+        let score = best.and_then(|best| best.score.as_ref());
+        let spatial_score = score.map_or(0, |score| score.spatial_score);
         let top1_score = reranked.then_some(spatial_score);
         self.metrics.query_answered(top1_score, confidence.matched);
-        confidence
     }
 }

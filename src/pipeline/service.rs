@@ -7,6 +7,7 @@ use super::calibrations::Calibrations;
 use super::extraction::Extraction;
 use super::maps::{Change, LiveMap, MapEntry, Maps};
 use super::patches::PatchCache;
+use super::tracks::TrackConfig;
 use super::{Caller, PipelineConfig, PipelineError};
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::metrics::{MemoryComponent, Rejection};
@@ -16,6 +17,7 @@ use placeformer_core::types::{
     ReferenceId,
 };
 use placeformer_store::{Cursor, MapInfo, Page, PlaceStore, StoreError};
+use placeformer_track::TrackKey;
 use placeformer_vision::rerank::{RerankConfig, Reranker};
 use std::sync::Arc;
 use std::time::Duration;
@@ -44,6 +46,9 @@ pub struct Service {
     pub(super) observing: Arc<Mutex<()>>,
     pub(super) memory: MemoryWatermark,
     pub(super) config: PipelineConfig,
+    pub(super) tracks: TrackConfig,
+    /// Authenticates the tokens of tracks.
+    pub(super) track_key: TrackKey,
     pub(super) metrics: Arc<Metrics>,
     pub(super) health: Arc<Health>,
 }

@@ -8,12 +8,14 @@ use super::calibrations::Calibrations;
 use super::extraction::Extraction;
 use super::maps::{LiveMap, MapEntry, Maps, Projection, index_entry};
 use super::patches::PatchCache;
+use super::tracks::TrackConfig;
 use super::{DescriptorSource, PipelineConfig, PipelineError, Service};
 use crate::ops::memory::MemoryWatermark;
 use crate::ops::{Health, Metrics};
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::ModelId;
 use placeformer_store::{MapInfo, PlaceStore, StoreError};
+use placeformer_track::TrackKey;
 use placeformer_vision::extract::Head;
 use placeformer_vision::image::ImageConfig;
 use placeformer_vision::rerank::{RerankConfig, Reranker};
@@ -37,6 +39,10 @@ pub struct Parts {
     pub rerank: RerankConfig,
     /// Settings of the pipeline.
     pub pipeline: PipelineConfig,
+    /// Settings of tracks.
+    pub tracks: TrackConfig,
+    /// Authenticates the tokens of tracks.
+    pub track_key: TrackKey,
     /// Where measurements go.
     pub metrics: Arc<Metrics>,
     /// Where progress goes.
@@ -55,10 +61,13 @@ impl Service {
             image,
             rerank,
             pipeline: config,
+            tracks,
+            track_key,
             metrics,
             health,
         } = parts;
         config.check()?;
+        tracks.check()?;
         let calibrations = Calibrations::new(rerank.id());
         let maps = build_indexes(&*store, &*source, &health)?;
         for (name, live) in maps.all() {
@@ -82,6 +91,8 @@ impl Service {
             observing: Arc::default(),
             memory: MemoryWatermark::new(config.memory_watermark_bytes),
             config,
+            tracks,
+            track_key,
             store,
             metrics,
             health,

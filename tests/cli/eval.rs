@@ -376,3 +376,47 @@ fn the_ablation_marks_its_base_once_on_every_axis() {
         rows.iter().filter(|row| row["axis"] == "codec").count()
     );
 }
+
+#[test]
+fn queries_are_followed_as_the_frames_of_a_drive() {
+    if !has_model() {
+        return;
+    }
+    let town = town("8", "2");
+    let folder = town.path();
+    let mut calibrate = words(
+        "eval calibrate --dataset csv --root town --cache cache --leave-out always \
+         --target-precision 0.8 --out own.json --input-size",
+    );
+    calibrate.push(SIZE);
+    succeeds(folder, &calibrate);
+    let more = words(
+        "--sequences --spacing 30 --max-speed 40 --calibration own.json --json out.json \
+         --html out.html --pictures 0",
+    );
+    let text = succeeds(folder, &eval(&more));
+    assert!(
+        text.contains("tracked") && text.contains("lost after"),
+        "{text}"
+    );
+    let json: Value =
+        serde_json::from_slice(&std::fs::read(folder.join("out.json")).unwrap()).unwrap();
+    let recall = |by: &str| json["recall"][by]["1"].as_f64().unwrap();
+    assert!(
+        recall("tracked") > 0.0 && recall("reranked") > 0.0,
+        "{}",
+        json["recall"]
+    );
+    let sequences = &json["sequences"];
+    for side in ["alone", "tracked"] {
+        assert_eq!(sequences[side]["judged"], json["queries"], "{sequences}");
+    }
+    let found = &sequences["found_again"];
+    let legs = found["frames"].as_array().unwrap().len() as u64 + found["never"].as_u64().unwrap();
+    assert_eq!(legs, 5, "{sequences}");
+    let page = std::fs::read_to_string(folder.join("out.html")).unwrap();
+    assert!(page.contains("Reliability of tracks"));
+    let mut without = words("eval --dataset csv --root town --max-speed 3 --input-size");
+    without.push(SIZE);
+    assert!(program::refusal(folder, &without).contains("--sequences"));
+}

@@ -142,7 +142,7 @@ fn picture(name: &str) -> Vec<u8> {
 }
 
 fn at(lat: f64, lon: f64) -> Value {
-    json!({"lat": lat, "lon": lon, "heading": null})
+    json!({"lat": lat, "lon": lon, "alt": null, "heading": null})
 }
 
 #[test]
@@ -350,6 +350,7 @@ fn positions_arrive_at_photos_that_are_there_and_are_told() {
     let served = Served::new();
     let says = Says {
         position: Some((10.0, 20.0)),
+        alt: None,
         heading: None,
         time: Some("2026:03:01 14:30:05"),
     };

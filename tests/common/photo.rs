@@ -6,6 +6,7 @@ use super::noise;
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Says {
     pub position: Option<(f64, f64)>,
+    pub alt: Option<u16>,
     pub heading: Option<u16>,
     /// `YYYY:MM:DD HH:MM:SS`.
     pub time: Option<&'static str>,
@@ -56,6 +57,7 @@ pub fn exif_block(says: Says) -> Vec<u8> {
         gps.push(text(3, if lon < 0.0 { "W" } else { "E" }));
         gps.push(millionths(4, lon));
     }
+    gps.extend(says.alt.map(|metres| millionths(6, f64::from(metres))));
     gps.extend(
         says.heading
             .map(|degrees| millionths(17, f64::from(degrees))),

@@ -2,8 +2,9 @@
 
 use half::f16;
 use placeformer_core::types::{
-    ContentHash, Descriptor, ExternalId, GLOBAL_DIM, GeoPoint, Heading, MapName, Metadata, ModelId,
-    NewReference, PackedPatches, PatchGrid, PoolingStride, ReferenceFields, Timestamp,
+    Altitude, ContentHash, Descriptor, ExternalId, GLOBAL_DIM, GeoPoint, Heading, MapName,
+    Metadata, ModelId, NewReference, PackedPatches, PatchGrid, PoolingStride, ReferenceFields,
+    Timestamp,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -65,6 +66,7 @@ pub fn reference(map: &MapName, seed: u64) -> NewReference {
         fields: ReferenceFields {
             external_id: None,
             location: Some(GeoPoint::new(51.0 + (seed % 1000) as f64 * 1e-4, 7.0).unwrap()),
+            alt: Altitude::new((seed % 500) as f64).ok(),
             heading: Some(Heading::new((seed % 360) as f64).unwrap()),
             captured_at: Some(captured),
             metadata: Some(metadata),

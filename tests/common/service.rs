@@ -15,6 +15,7 @@ use placeformer_core::types::{
     ScaleKeyPatches,
 };
 use placeformer_store::{PlaceStore, SqliteStore, StoreConfig};
+use placeformer_track::{KEY_BYTES, TrackKey};
 use placeformer_vision::extract::pack;
 use placeformer_vision::extract::{Aggregate, ExtractError, Head};
 use placeformer_vision::image::{ImageConfig, ImageError, load_tensor};
@@ -474,6 +475,7 @@ fn start(
         image,
         rerank,
         pipeline,
+        tracks,
         ..
     } = config;
     let service = Service::start(Parts {
@@ -482,6 +484,8 @@ fn start(
         image,
         rerank,
         pipeline,
+        tracks,
+        track_key: TrackKey::new(&[7; KEY_BYTES]),
         metrics,
         health,
     })

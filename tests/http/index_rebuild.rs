@@ -403,6 +403,8 @@ fn rebuild(store: &SqliteStore, map: &MapName) -> MapIndex {
                     id,
                     global,
                     location: row.location,
+                    alt: row.alt,
+                    heading: row.heading,
                     captured_at: row.captured_at,
                 });
             })
@@ -416,6 +418,8 @@ fn entry(reference: &Reference, new: &NewReference) -> IndexEntry {
         id: reference.id,
         global: new.descriptor.global.clone(),
         location: reference.fields.location,
+        alt: reference.fields.alt,
+        heading: reference.fields.heading,
         captured_at: reference.fields.captured_at,
     }
 }

@@ -31,4 +31,5 @@ mod routes;
 mod slow_clients;
 mod surface;
 mod tls;
+mod tracks;
 mod uninformative;

@@ -8,12 +8,13 @@ use serde_json::{Value, json};
 
 const EVERYTHING: Says = Says {
     position: Some((48.8584, -2.2945)),
+    alt: Some(115),
     heading: Some(270),
     time: Some("2026:03:01 14:30:05+02:00"),
 };
 
-fn sources(location: Value, heading: Value, captured_at: Value) -> Value {
-    json!({"location": location, "heading": heading, "captured_at": captured_at})
+fn sources(location: Value, alt: Value, heading: Value, captured_at: Value) -> Value {
+    json!({"location": location, "alt": alt, "heading": heading, "captured_at": captured_at})
 }
 
 #[tokio::test]
@@ -23,11 +24,11 @@ async fn what_the_request_leaves_out_is_read_from_the_photo() {
     let path = "/references?map=m&external_id=a";
     let created = app.post(path, "image/png", photo.clone()).await;
     let body = created.created();
-    let location = json!({"lat": 48.8584, "lon": -2.2945, "heading": 270.0});
+    let location = json!({"lat": 48.8584, "lon": -2.2945, "alt": 115.0, "heading": 270.0});
     assert_eq!(body["location"], location);
     assert_eq!(body["captured_at"], "2026-03-01T12:30:05Z");
     let exif = || json!("exif");
-    assert_eq!(body["sources"], sources(exif(), exif(), exif()));
+    assert_eq!(body["sources"], sources(exif(), exif(), exif(), exif()));
     // It is stored, and found there when the photo is sent again.
     let stored = app.get(created.header("location")).await;
     assert_eq!(stored.ok()["location"], location);
@@ -37,7 +38,10 @@ async fn what_the_request_leaves_out_is_read_from_the_photo() {
         .await;
     assert_eq!(again.ok()["location"], location);
     let stored = || json!("stored");
-    assert_eq!(again.json["sources"], sources(stored(), stored(), stored()));
+    assert_eq!(
+        again.json["sources"],
+        sources(stored(), stored(), stored(), stored())
+    );
 }
 
 #[tokio::test]
@@ -48,11 +52,16 @@ async fn the_request_comes_first_field_by_field() {
         .post("/references?map=m&lat=1&lon=2", "image/png", photo.clone())
         .await;
     let body = created.created();
-    let location = json!({"lat": 1.0, "lon": 2.0, "heading": 270.0});
+    let location = json!({"lat": 1.0, "lon": 2.0, "alt": 115.0, "heading": 270.0});
     assert_eq!(body["location"], location);
     assert_eq!(
         body["sources"],
-        sources(json!("request"), json!("exif"), json!("exif"))
+        sources(
+            json!("request"),
+            json!("exif"),
+            json!("exif"),
+            json!("exif")
+        )
     );
     let path = "/references?map=m&heading=5&captured_at=2020-01-01T00:00:00Z";
     let body = app.post(path, "image/png", photo).await;
@@ -61,7 +70,12 @@ async fn the_request_comes_first_field_by_field() {
     assert_eq!(body["captured_at"], "2020-01-01T00:00:00Z");
     assert_eq!(
         body["sources"],
-        sources(json!("exif"), json!("request"), json!("request"))
+        sources(
+            json!("exif"),
+            json!("exif"),
+            json!("request"),
+            json!("request")
+        )
     );
 }
 
@@ -69,7 +83,7 @@ async fn the_request_comes_first_field_by_field() {
 async fn the_photo_is_left_alone_where_the_request_says_so() {
     let app = App::new();
     let photo = png_with_exif(1, EVERYTHING);
-    let nothing = sources(Value::Null, Value::Null, Value::Null);
+    let nothing = sources(Value::Null, Value::Null, Value::Null, Value::Null);
     let raw = app
         .post("/references?map=m&exif=false", "image/png", photo.clone())
         .await;
@@ -104,18 +118,18 @@ async fn xmp_is_read_too_and_a_photo_may_say_nothing() {
     let photo = png_with_xmp(1, properties);
     let created = app.post("/references?map=m", "image/png", photo).await;
     let body = created.created();
-    let location = json!({"lat": 48.8584, "lon": 2.2945, "heading": 270.0});
+    let location = json!({"lat": 48.8584, "lon": 2.2945, "alt": null, "heading": 270.0});
     assert_eq!(body["location"], location);
     assert_eq!(
         body["sources"],
-        sources(json!("xmp"), json!("xmp"), Value::Null)
+        sources(json!("xmp"), Value::Null, json!("xmp"), Value::Null)
     );
     let body = app.post_png("/references?map=m", 2).await;
     let body = body.created();
     assert_eq!(body["location"], Value::Null);
     assert_eq!(
         body["sources"],
-        sources(Value::Null, Value::Null, Value::Null)
+        sources(Value::Null, Value::Null, Value::Null, Value::Null)
     );
 }
 

@@ -14,7 +14,7 @@ async fn a_reference_is_created_shown_changed_and_deleted() {
     let body = created.created();
     assert_eq!(
         body["location"],
-        json!({"lat": 51.5, "lon": -0.1, "heading": 270.0})
+        json!({"lat": 51.5, "lon": -0.1, "alt": null, "heading": 270.0})
     );
     assert_eq!(
         (&body["map"], &body["external_id"]),
@@ -31,6 +31,7 @@ async fn a_reference_is_created_shown_changed_and_deleted() {
     let mut stored = app.get(&path).await.ok().clone();
     stored["sources"] = json!({
         "location": "request",
+        "alt": null,
         "heading": "request",
         "captured_at": "request",
     });
@@ -44,7 +45,7 @@ async fn a_reference_is_created_shown_changed_and_deleted() {
         .await;
     assert_eq!(
         changed.ok()["location"],
-        json!({"lat": null, "lon": null, "heading": 270.0})
+        json!({"lat": null, "lon": null, "alt": null, "heading": 270.0})
     );
     assert_eq!(changed.json["external_id"], "b");
     assert_eq!(changed.json["metadata"], json!({"camera": "left"}));
@@ -128,7 +129,7 @@ async fn a_query_is_answered_with_ranked_evidence() {
     );
     assert_eq!(
         results[0]["location"],
-        json!({"lat": 50.5, "lon": 8.0, "heading": null})
+        json!({"lat": 50.5, "lon": 8.0, "alt": null, "heading": null})
     );
     let scores = results[0]["scores"].as_object().unwrap();
     assert_eq!(scores.keys().collect::<Vec<_>>(), ["s11", "s12", "s23"]);

@@ -68,6 +68,21 @@ error_codes! {
     /// No image bytes were sent.
     EmptyImage = "empty_image", 400, false, None,
         "The image is empty";
+    /// The token of a track is not whole, or not one of this release.
+    TrackMalformed = "track_malformed", 400, false, None,
+        "The token of the track is damaged";
+    /// The token of a track was not made by this service.
+    TrackForged = "track_forged", 400, false, None,
+        "The token of the track is not this service's";
+    /// The token of a track is too old.
+    TrackExpired = "track_expired", 400, false, None,
+        "The token of the track is too old";
+    /// The token of a track is of another map.
+    TrackOtherMap = "track_other_map", 400, false, None,
+        "The token of the track is of another map";
+    /// The map has another model than when the track's token was made.
+    TrackOtherModel = "track_other_model", 400, false, None,
+        "The token of the track is of another model";
     /// No or wrong credentials.
     Unauthorized = "unauthorized", 401, false, None,
         "Credentials are missing or wrong";
@@ -101,6 +116,9 @@ error_codes! {
     /// The map was built with another model.
     ModelMismatch = "model_mismatch", 409, false, None,
         "The map was built with another model";
+    /// The map has no positions, or no calibration, from which a track could be kept.
+    TrackUnavailable = "track_unavailable", 409, false, None,
+        "The map cannot be tracked in";
     /// The calibration belongs to another model or another re-ranking.
     CalibrationMismatch = "calibration_mismatch", 409, false, None,
         "The calibration was fitted for something else";

@@ -12,6 +12,9 @@ const PRIVATE_DIRECTORY: u32 = 0o750;
 /// Who may open a file of data: its owner, and its group to read.
 const PRIVATE_FILE: u32 = 0o640;
 
+/// Who may open a secret: its owner.
+const SECRET_FILE: u32 = 0o600;
+
 /// Makes a directory, and those above it, that others than its owner and its group cannot enter,
 /// whatever the umask says. One that is there stays as it is: its owner decided that.
 ///
@@ -74,6 +77,23 @@ pub fn write_private_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     replace_with(path, |part| {
         create_private_file(part)?;
         write_and_sync(part, bytes)
+    })
+}
+
+/// As [`write_atomically`], for a secret: a file that nobody but its owner can read.
+///
+/// # Errors
+/// As [`write_atomically`].
+pub fn write_secret_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    replace_with(path, |part| {
+        let mut options = OpenOptions::new();
+        let mut file = options
+            .write(true)
+            .create_new(true)
+            .mode(SECRET_FILE)
+            .open(part)?;
+        file.write_all(bytes)?;
+        file.sync_all()
     })
 }
 

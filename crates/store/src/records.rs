@@ -1,7 +1,7 @@
 //! What goes into a store and comes out of it.
 
 use placeformer_core::types::{
-    Calibration, ExternalId, GeoPoint, Heading, InvalidValue, MapName, Metadata, ModelId,
+    Altitude, Calibration, ExternalId, GeoPoint, Heading, InvalidValue, MapName, Metadata, ModelId,
     Reference, ReferenceFields, ReferenceId, Timestamp,
 };
 use std::fmt;
@@ -40,6 +40,10 @@ pub struct GlobalRow {
     pub global: Vec<f32>,
     /// Its location.
     pub location: Option<GeoPoint>,
+    /// How high it was taken.
+    pub alt: Option<Altitude>,
+    /// Where its camera looked.
+    pub heading: Option<Heading>,
     /// Its capture time.
     pub captured_at: Option<Timestamp>,
 }
@@ -105,6 +109,8 @@ pub struct ReferencePatch {
     pub external_id: Option<Option<ExternalId>>,
     /// New location.
     pub location: Option<Option<GeoPoint>>,
+    /// New height.
+    pub alt: Option<Option<Altitude>>,
     /// New heading.
     pub heading: Option<Option<Heading>>,
     /// New capture time.
@@ -121,6 +127,9 @@ impl ReferencePatch {
         }
         if let Some(location) = self.location {
             fields.location = location;
+        }
+        if let Some(alt) = self.alt {
+            fields.alt = alt;
         }
         if let Some(heading) = self.heading {
             fields.heading = heading;

@@ -2,13 +2,14 @@
 
 use crate::ops::{Health, Metrics};
 use crate::pipeline::{
-    Caller, IngestRequest, Parts, PipelineConfig, QueryOptions, QueryRequest, Service,
+    Caller, IngestRequest, Parts, PipelineConfig, QueryOptions, QueryRequest, Service, TrackConfig,
 };
 use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt, stream};
 use placeformer_core::types::{MapName, ReferenceFields};
 use placeformer_lab::bench::{MeasuredService, ServiceError, StartService};
 use placeformer_store::CombinedStore;
+use placeformer_track::TrackKey;
 use placeformer_vision::extract::Extractor;
 use placeformer_vision::image::ImageConfig;
 use placeformer_vision::rerank::RerankConfig;
@@ -38,6 +39,8 @@ impl StartService for PipelineServices {
             image: ImageConfig::default(),
             rerank: RerankConfig::default(),
             pipeline,
+            tracks: TrackConfig::default(),
+            track_key: TrackKey::random()?,
             metrics: Arc::new(Metrics::new()?),
             health: Arc::new(Health::default()),
         })?;

@@ -8,6 +8,7 @@ use placeformer_core::types::ScaleSet;
 use placeformer_lab::choice::Choice;
 use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions, GroundPart};
 use placeformer_lab::eval::features::{Describe, FeatureCache, GlobalKind};
+use placeformer_lab::eval::sequences::SequenceOptions;
 use placeformer_vision::extract::Preset;
 use placeformer_vision::rerank::RerankConfig;
 use std::path::PathBuf;
@@ -121,6 +122,67 @@ pub(super) struct RerankArgs {
         value_name = "SET"
     )]
     pub(super) scales: Vec<ScaleSet>,
+}
+
+/// Whether and how queries are followed as the frames of a drive.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Sequences")]
+pub(super) struct SequenceArgs {
+    /// Follow the queries in the order of their names as the frames of a drive, too, each with what
+    /// was believed after the one before: recall, trust, and how soon a vehicle is found again that
+    /// was carried elsewhere.
+    #[arg(long)]
+    sequences: bool,
+    /// Seconds between two frames.
+    #[arg(
+        long,
+        default_value_t = 1.0,
+        value_name = "SECONDS",
+        requires = "sequences"
+    )]
+    frame_seconds: f64,
+    /// Highest speed of the vehicle.
+    #[arg(
+        long,
+        default_value_t = 15.0,
+        value_name = "M/S",
+        requires = "sequences"
+    )]
+    max_speed: f64,
+    /// Metres between two references that follow each other by name, where the data set gives no
+    /// positions.
+    #[arg(
+        long,
+        default_value_t = 10.0,
+        value_name = "METRES",
+        requires = "sequences"
+    )]
+    spacing: f64,
+    /// Give the filter odometry with this error, as a share of the distance; needs positions.
+    #[arg(long, value_name = "SHARE", requires = "sequences")]
+    odometry_error: Option<f64>,
+    /// Legs of the drive in which the vehicle is carried elsewhere.
+    #[arg(long, default_value_t = 6, value_name = "N", requires = "sequences")]
+    legs: usize,
+}
+
+impl SequenceArgs {
+    /// The options, if sequences are wanted.
+    pub(super) fn options(&self, seed: u64) -> anyhow::Result<Option<SequenceOptions>> {
+        if !self.sequences {
+            return Ok(None);
+        }
+        let options = SequenceOptions {
+            frame_seconds: self.frame_seconds,
+            max_speed_mps: self.max_speed,
+            spacing_m: self.spacing,
+            odometry_error: self.odometry_error,
+            legs: self.legs,
+            seed,
+        };
+        options.check()?;
+        Ok(Some(options))
+    }
 }
 
 /// Where results go.

@@ -1,25 +1,27 @@
 //! Measure recall on a data set.
 
-use super::args::{DataArgs, MethodArgs, OutputArgs};
+use super::args::{DataArgs, MethodArgs, OutputArgs, SequenceArgs};
 use super::{describe, open_describer, write};
 use crate::cli::model_args::ModelOptions;
 use crate::cli::output::{note, say_part};
 use crate::cli::progress::ProgressBars;
 use anyhow::{Context, bail};
 use maud::html;
-use placeformer_core::types::Calibration;
+use placeformer_core::types::{Calibration, ConfidenceCurve};
 use placeformer_lab::datasets::{Dataset, DatasetKind};
 use placeformer_lab::eval::ablate::{Ablation, Base, ablate};
 use placeformer_lab::eval::answers::DatasetAnswers;
+use placeformer_lab::eval::calibrate::shipped_curve;
 use placeformer_lab::eval::features::{Describe, ModelDescriber};
 use placeformer_lab::eval::own_places::{LeaveOut, OwnPlaces};
 use placeformer_lab::eval::report::{Painter, gallery};
 use placeformer_lab::eval::run::Answer;
+use placeformer_lab::eval::sequences::{SequenceRun, measure_sequences};
 use placeformer_lab::eval::summarise::summarise;
 use placeformer_lab::eval::summary::{RunConfig, Summary};
 use placeformer_lab::eval::{EvalError, prediction, report};
 use placeformer_vision::extract::ExtractConfig;
-use placeformer_vision::rerank::Reranker;
+use placeformer_vision::rerank::{RerankConfig, Reranker};
 use std::path::Path;
 
 /// Arguments of an evaluation without a further subcommand.
@@ -32,12 +34,15 @@ pub(super) struct MeasureArgs {
     #[command(flatten)]
     method: MethodArgs,
     #[command(flatten)]
+    sequences: SequenceArgs,
+    #[command(flatten)]
     output: OutputArgs,
 }
 
 /// Runs it.
 pub(super) fn run(args: MeasureArgs) -> anyhow::Result<()> {
     args.method.rerank.check()?;
+    args.sequences.options(args.method.seed)?;
     let dataset = args.data.load()?;
     let extract = args.model.extract_config()?;
     let describer = open_describer(&extract)?;
@@ -117,7 +122,7 @@ fn measure(
         config.rerank.as_ref(),
         &progress,
     )?;
-    let summary = summarise(
+    let mut summary = summarise(
         dataset,
         &described.database,
         &described.queries,
@@ -125,7 +130,31 @@ fn measure(
         config,
         given.as_ref(),
     );
+    if let Some(options) = args.sequences.options(method.seed)? {
+        let config = summary.config.clone();
+        let run = SequenceRun {
+            dataset,
+            described: &described,
+            answers: &answers,
+            rerank: config.rerank.as_ref(),
+            curve: &curve(&config, given.as_ref())?,
+            options,
+        };
+        measure_sequences(&run, &mut summary)?;
+    }
     Ok((answers, summary))
+}
+
+/// What turns scores into confidences: the calibration given, or else the model's own.
+fn curve(config: &RunConfig, given: Option<&Calibration>) -> anyhow::Result<ConfidenceCurve> {
+    if let Some(given) = given {
+        return Ok(given.curve(config.rerank.is_some()).clone());
+    }
+    let rerank = config.rerank.as_ref().map(RerankConfig::id);
+    shipped_curve(&config.model, rerank.as_ref()).context(
+        "the model has no calibration for this re-ranking, which tracks need: fit one with \
+         `eval calibrate --out`, and give it with --calibration",
+    )
 }
 
 fn read_calibration(path: &Path) -> anyhow::Result<Calibration> {

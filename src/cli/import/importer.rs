@@ -259,6 +259,7 @@ fn difference(stored: &Stored, facts: &PhotoFacts) -> (ReferencePatch, Vec<&'sta
         given.location,
         PartialEq::eq,
     );
+    let alt = better(fields.alt, stored.alt, given.alt, PartialEq::eq);
     let heading = better(fields.heading, stored.heading, given.heading, PartialEq::eq);
     let captured_at = better(
         fields.captured_at,
@@ -268,12 +269,14 @@ fn difference(stored: &Stored, facts: &PhotoFacts) -> (ReferencePatch, Vec<&'sta
     );
     let names = [
         ("location", location.is_some()),
+        ("alt", alt.is_some()),
         ("heading", heading.is_some()),
         ("captured_at", captured_at.is_some()),
     ];
     let changed = names.into_iter().filter(|(_, is_changed)| *is_changed);
     let patch = ReferencePatch {
         location: location.map(Some),
+        alt: alt.map(Some),
         heading: heading.map(Some),
         captured_at: captured_at.map(Some),
         ..ReferencePatch::default()

@@ -1,5 +1,5 @@
-//! Position, heading and time of a photo: from the positions file, else from its name, else from
-//! its own EXIF and XMP.
+//! Position, height, heading and time of a photo: from the positions file, else from its name, else
+//! from its own EXIF and XMP.
 //!
 //! Each field is taken from the first source that has it.
 
@@ -37,6 +37,7 @@ pub(super) struct PhotoFacts {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct GivenFields {
     pub(super) location: bool,
+    pub(super) alt: bool,
     pub(super) heading: bool,
     pub(super) captured_at: bool,
 }
@@ -55,6 +56,7 @@ impl Metadata {
             row: self.positions.row(name),
             given: GivenFields {
                 location: true,
+                alt: true,
                 heading: true,
                 captured_at: true,
             },
@@ -71,6 +73,10 @@ impl Metadata {
             if fields.location.is_none() && row.location.is_some() {
                 fields.location = row.location;
                 facts.given.location = given.location;
+            }
+            if fields.alt.is_none() && row.alt.is_some() {
+                fields.alt = row.alt;
+                facts.given.alt = given.alt;
             }
             if fields.heading.is_none() && row.heading.is_some() {
                 fields.heading = row.heading;
@@ -93,6 +99,7 @@ impl Metadata {
         let source = Source {
             row: Row {
                 location: position.location,
+                alt: None,
                 heading: parsed.heading,
                 captured_at: parsed.captured_at,
             },
@@ -114,6 +121,7 @@ impl Metadata {
         Source {
             row: Row {
                 location: exif.location,
+                alt: exif.alt,
                 heading: exif.heading,
                 captured_at: in_zone.or(exif.captured_at),
             },

@@ -72,7 +72,8 @@ pub struct ImportArgs {
     api_key: Option<String>,
     #[command(flatten)]
     trust: TrustArgs,
-    /// Table (CSV) with the columns file, and any of lat and lon, heading, captured_at (RFC 3339).
+    /// Table (CSV) with the columns file, and any of lat and lon, alt (metres), heading,
+    /// captured_at (RFC 3339).
     ///
     /// Usual other headings are known (latitude, lng, filename, ...), and columns may be separated
     /// by commas, semicolons or tabs. Rows name photos by their path below the folder or the

@@ -5,7 +5,9 @@ use super::sink::{Outcome, Sent, Sink, Stored, Upload};
 use crate::cli::client::{BYTES, ClientError, Connection, ServerArgs, ServerClient};
 use anyhow::Context;
 use placeformer_core::error::ErrorCode;
-use placeformer_core::types::{ContentHash, GeoPoint, Heading, MapName, ReferenceId, Timestamp};
+use placeformer_core::types::{
+    Altitude, ContentHash, GeoPoint, Heading, MapName, ReferenceId, Timestamp,
+};
 use placeformer_store::ReferencePatch;
 use reqwest::header::CONTENT_TYPE;
 use reqwest::{Method, RequestBuilder, StatusCode};
@@ -52,6 +54,7 @@ struct ListedReference {
 struct ListedLocation {
     lat: Option<f64>,
     lon: Option<f64>,
+    alt: Option<f64>,
     heading: Option<f64>,
 }
 
@@ -60,12 +63,18 @@ impl ListedReference {
     fn stored(self) -> Option<Stored> {
         let mut content = [0; 32];
         hex::decode_to_slice(&self.content_sha256, &mut content).ok()?;
-        let ListedLocation { lat, lon, heading } = self.location.unwrap_or_default();
+        let ListedLocation {
+            lat,
+            lon,
+            alt,
+            heading,
+        } = self.location.unwrap_or_default();
         let location = lat.zip(lon).map(|(lat, lon)| GeoPoint::new(lat, lon));
         Some(Stored {
             id: self.id,
             content: ContentHash(content),
             location: location.transpose().ok()?,
+            alt: alt.map(Altitude::new).transpose().ok()?,
             heading: heading.map(Heading::new).transpose().ok()?,
             captured_at: self.captured_at,
         })
@@ -175,6 +184,9 @@ fn change(patch: &ReferencePatch) -> Value {
         body.insert("lat".into(), location.lat().into());
         body.insert("lon".into(), location.lon().into());
     }
+    if let Some(Some(alt)) = patch.alt {
+        body.insert("alt".into(), alt.metres().into());
+    }
     if let Some(Some(heading)) = patch.heading {
         body.insert("heading".into(), heading.degrees().into());
     }
@@ -217,6 +229,9 @@ fn parameters(upload: &Upload) -> Vec<(&'static str, String)> {
     if let Some(location) = fields.location {
         parameters.push(("lat", location.lat().to_string()));
         parameters.push(("lon", location.lon().to_string()));
+    }
+    if let Some(alt) = fields.alt {
+        parameters.push(("alt", alt.metres().to_string()));
     }
     if let Some(heading) = fields.heading {
         parameters.push(("heading", heading.degrees().to_string()));

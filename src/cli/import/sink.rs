@@ -4,7 +4,7 @@ use crate::cli::client::UNREACHABLE;
 use bytes::Bytes;
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{
-    ContentHash, GeoPoint, Heading, MapName, ReferenceFields, ReferenceId, Timestamp,
+    Altitude, ContentHash, GeoPoint, Heading, MapName, ReferenceFields, ReferenceId, Timestamp,
 };
 use placeformer_store::ReferencePatch;
 use std::collections::HashMap;
@@ -24,6 +24,7 @@ pub(super) struct Stored {
     /// Hash of the photo's bytes.
     pub(super) content: ContentHash,
     pub(super) location: Option<GeoPoint>,
+    pub(super) alt: Option<Altitude>,
     pub(super) heading: Option<Heading>,
     pub(super) captured_at: Option<Timestamp>,
 }

@@ -10,6 +10,7 @@ use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{MapName, Reference, ReferenceId};
 use placeformer_models::open_extractor;
 use placeformer_store::{Cursor, Page, ReferencePatch, SqliteStore};
+use placeformer_track::TrackKey;
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -51,6 +52,8 @@ impl StoreSink {
             image: config.image,
             rerank: config.rerank,
             pipeline: config.pipeline,
+            tracks: config.tracks,
+            track_key: TrackKey::random()?,
             metrics: Arc::new(Metrics::new()?),
             health: Arc::new(Health::default()),
         })?;
@@ -127,6 +130,7 @@ impl From<&Reference> for Stored {
             id: reference.id,
             content: reference.content_hash,
             location: reference.fields.location,
+            alt: reference.fields.alt,
             heading: reference.fields.heading,
             captured_at: reference.fields.captured_at,
         }

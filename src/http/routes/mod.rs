@@ -108,6 +108,12 @@ pub static ROUTES: &[Route] = &[
         own_errors: &[
             ErrorCode::MapNotFound,
             ErrorCode::ModelMismatch,
+            ErrorCode::TrackMalformed,
+            ErrorCode::TrackForged,
+            ErrorCode::TrackExpired,
+            ErrorCode::TrackOtherMap,
+            ErrorCode::TrackOtherModel,
+            ErrorCode::TrackUnavailable,
             ErrorCode::CorruptRecord,
             ErrorCode::DeadlineExceeded,
         ],

@@ -6,14 +6,18 @@ use crate::http::body::{ImageUpload, read_upload};
 use crate::http::examples;
 use crate::http::problem::ApiError;
 use crate::http::state::AppState;
-use crate::pipeline::{QueryAnswer, QueryOptions, QueryRequest, QueryResult, UnmatchedReason};
+use crate::pipeline::{
+    QueryAnswer, QueryOptions, QueryRequest, QueryResult, TrackAnswer, TrackOptions,
+    UnmatchedReason,
+};
 use axum::Extension;
 use axum::extract::{Request, State};
 use axum::http::StatusCode;
 use axum::response::Response;
 use placeformer_core::types::{
-    Deadline, GeoCircle, GeoPoint, MapName, Metadata, ReferenceFilter, Timestamp,
+    Altitude, Deadline, GeoCircle, GeoPoint, Heading, MapName, Metadata, ReferenceFilter, Timestamp,
 };
+use placeformer_track::Estimate;
 use placeformer_vision::rerank::PairScore;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -69,6 +73,38 @@ pub struct QueryParams {
     #[param(value_type = Option<String>, format = DateTime)]
     #[serde(default)]
     pub captured_before: Option<Timestamp>,
+    /// Continues a track: the token of the previous answer, or empty to begin one. The answer is
+    /// then ranked by all that is known of the vehicle, and has the next token.
+    #[schema(max_length = 8192)]
+    #[param(max_length = 8192, example = "")]
+    pub track: Option<String>,
+    /// When the frame was taken (RFC 3339), by the vehicle's clock; with every frame of a track or
+    /// with none. Left out: when it arrives.
+    #[schema(value_type = Option<String>, format = DateTime)]
+    #[param(value_type = Option<String>, format = DateTime)]
+    #[serde(default)]
+    pub captured_at: Option<Timestamp>,
+    /// Metres that the vehicle moved since the previous frame, by odometry.
+    #[schema(minimum = 0)]
+    #[param(minimum = 0, example = 12.5)]
+    pub moved_m: Option<f64>,
+    /// Standard deviation of `moved_m`; a tenth of it and a metre if left out.
+    #[schema(minimum = 0)]
+    #[param(minimum = 0, example = 0.5)]
+    pub moved_sigma_m: Option<f64>,
+    /// Degrees that the vehicle turned since the previous frame, clockwise positive.
+    #[schema(minimum = -3600, maximum = 3600)]
+    #[param(minimum = -3600, maximum = 3600, example = -15)]
+    pub turned_deg: Option<f64>,
+    /// Standard deviation of `turned_deg`; 5 if left out.
+    #[schema(exclusive_minimum = 0, maximum = 360)]
+    #[param(exclusive_minimum = 0, maximum = 360, example = 2)]
+    pub turned_sigma_deg: Option<f64>,
+    /// Highest speed of the vehicle in metres a second, which bounds how far it came where there is
+    /// no `moved_m`; 40 unless configured otherwise.
+    #[schema(exclusive_minimum = 0, maximum = 1000)]
+    #[param(exclusive_minimum = 0, maximum = 1000, example = 14)]
+    pub max_speed_mps: Option<f64>,
     /// Milliseconds for the answer, counted from the arrival of the request's head. Too short for
     /// re-ranking, the answer is the global ranking and says `"reranked": false`.
     #[schema(minimum = 1)]
@@ -98,6 +134,7 @@ impl QueryParams {
             captured_after: self.captured_after,
             captured_before: self.captured_before,
         };
+        let track = self.track_options()?;
         if self.deadline_ms == Some(0) {
             return Err(ApiError::invalid("deadline_ms: it must be at least 1"));
         }
@@ -112,9 +149,37 @@ impl QueryParams {
                 rerank: self.rerank,
                 filter,
                 deadline: None,
+                track,
             },
             budget: self.deadline_ms.map(Duration::from_millis),
         })
+    }
+
+    /// What continues a track. The numbers are left to the pipeline, which knows their bounds.
+    fn track_options(&self) -> Result<Option<TrackOptions>, ApiError> {
+        let only_in_tracks = [
+            ("captured_at", self.captured_at.is_some()),
+            ("moved_m", self.moved_m.is_some()),
+            ("moved_sigma_m", self.moved_sigma_m.is_some()),
+            ("turned_deg", self.turned_deg.is_some()),
+            ("turned_sigma_deg", self.turned_sigma_deg.is_some()),
+            ("max_speed_mps", self.max_speed_mps.is_some()),
+        ];
+        let Some(token) = &self.track else {
+            return match only_in_tracks.iter().find(|(_, is_given)| *is_given) {
+                Some((name, _)) => Err(ApiError::invalid(format!("{name}: it needs track"))),
+                None => Ok(None),
+            };
+        };
+        Ok(Some(TrackOptions {
+            token: token.clone(),
+            captured_at: self.captured_at,
+            moved_m: self.moved_m,
+            moved_sigma_m: self.moved_sigma_m,
+            turned_deg: self.turned_deg,
+            turned_sigma_deg: self.turned_sigma_deg,
+            max_speed_mps: self.max_speed_mps,
+        }))
     }
 
     fn near(&self) -> Result<Option<GeoCircle>, ApiError> {
@@ -144,11 +209,13 @@ fn parse_point(text: &str) -> Result<GeoPoint, ApiError> {
 pub struct QueryAnswerBody {
     /// Best first.
     pub results: Vec<QueryResultBody>,
-    /// Whether the order comes from re-ranking; else it is the order of global distance.
+    /// Whether the candidates were re-ranked; the order is then that of S, else that of global
+    /// distance. In a track it is that of the probability by all that is known.
     pub reranked: bool,
     /// Whether the first result is trusted: its confidence reaches the threshold of the map's
     /// calibration, else of the model's. False without any result, and for a photo that shows nothing
-    /// to know a place by; else null if there is no calibration.
+    /// to know a place by; else null if there is no calibration. In a track the confidence is that of
+    /// the track.
     pub matched: Option<bool>,
     /// Probability that the first result shows the right place; 0 without any result, and for a photo
     /// that shows nothing to know a place by; else null if there is no calibration.
@@ -156,6 +223,11 @@ pub struct QueryAnswerBody {
     pub confidence: Option<f64>,
     /// Why the first result is not trusted; null if it is, or if there is no calibration.
     pub unmatched_reason: Option<UnmatchedReasonName>,
+    /// Where exactly the photo was taken; null if the first result is not trusted, or has no
+    /// position.
+    pub estimate: Option<EstimateBody>,
+    /// The track after this frame; null if the query is not one of a track.
+    pub track: Option<TrackBody>,
     /// Milliseconds per stage, as in the `Server-Timing` header.
     #[schema(
         value_type = std::collections::HashMap<String, f64>,
@@ -186,6 +258,69 @@ impl From<UnmatchedReason> for UnmatchedReasonName {
             UnmatchedReason::NoResults => Self::NoResults,
             UnmatchedReason::ImageUninformative => Self::ImageUninformative,
             UnmatchedReason::LowConfidence => Self::LowConfidence,
+        }
+    }
+}
+
+/// Where a trusted photo was taken: the mean of the references that see the place, each weighed by
+/// its probability.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct EstimateBody {
+    /// Latitude in degrees.
+    pub lat: f64,
+    /// Longitude in degrees.
+    pub lon: f64,
+    /// Height in metres, as the references say it; null if none of them does.
+    pub alt: Option<f64>,
+    /// Degrees clockwise from north; null if no reference has a heading.
+    pub heading: Option<f64>,
+    /// Radius in metres that holds the true position in 68 of 100 cases.
+    pub accuracy_m: f64,
+    /// Degrees to each side that hold the true heading in 68 of 100 cases; null without one.
+    pub accuracy_deg: Option<f64>,
+    /// Covariance of the position in square metres: east-east, east-north, north-east,
+    /// north-north.
+    #[schema(example = json!([31.2, 4.0, 4.0, 27.5]))]
+    pub horizontal_covariance: [f64; 4],
+}
+
+impl From<Estimate> for EstimateBody {
+    fn from(estimate: Estimate) -> Self {
+        Self {
+            lat: estimate.point.lat(),
+            lon: estimate.point.lon(),
+            alt: estimate.alt.map(Altitude::metres),
+            heading: estimate.heading.map(Heading::degrees),
+            accuracy_m: estimate.accuracy_m,
+            accuracy_deg: estimate.accuracy_deg,
+            horizontal_covariance: estimate.covariance,
+        }
+    }
+}
+
+/// What is known of a vehicle after a frame.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct TrackBody {
+    /// To be sent as `track` with the next frame, to any node that has the same key.
+    #[schema(max_length = 8192)]
+    pub token: String,
+    /// Probability that the vehicle is where the first result shows it.
+    #[schema(minimum = 0, maximum = 1, example = 0.99)]
+    pub probability: f64,
+    /// Whether the vehicle is more likely at no known place.
+    pub lost: bool,
+    /// Frames so far.
+    #[schema(minimum = 1, example = 17)]
+    pub frames: u32,
+}
+
+impl From<TrackAnswer> for TrackBody {
+    fn from(track: TrackAnswer) -> Self {
+        Self {
+            token: track.token,
+            probability: track.probability,
+            lost: track.lost,
+            frames: track.frames,
         }
     }
 }
@@ -260,6 +395,9 @@ fn scores(score: &PairScore) -> BTreeMap<String, CombinationBody> {
 ///
 /// The image is the raw body with the options as query parameters, or a multipart part `image`
 /// beside a part `json`, or base64 in JSON beside the options.
+///
+/// The frames of a vehicle make a track: each query takes the token of the answer before. What is
+/// known of the vehicle then decides between places that look alike, and says when it is lost.
 #[utoipa::path(
     post,
     path = "/query",
@@ -317,6 +455,8 @@ fn answer_body(answer: QueryAnswer) -> QueryAnswerBody {
         matched: answer.confidence.matched,
         confidence: answer.confidence.confidence,
         unmatched_reason: answer.confidence.reason.map(Into::into),
+        estimate: answer.estimate.map(Into::into),
+        track: answer.track.map(Into::into),
         timings_ms: timings_ms(&answer.timings),
         model: answer.model.to_string(),
     }

@@ -15,7 +15,7 @@ use axum::http::{HeaderValue, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{
-    ExternalId, Heading, MapName, Metadata, ReferenceFields, ReferenceId, Timestamp,
+    Altitude, ExternalId, Heading, MapName, Metadata, ReferenceFields, ReferenceId, Timestamp,
 };
 use placeformer_store::{Cursor, ReferencePatch};
 use serde::{Deserialize, Serialize};
@@ -65,6 +65,11 @@ pub struct ReferenceParams {
     #[schema(minimum = -180, maximum = 180)]
     #[param(minimum = -180, maximum = 180, example = -0.1276)]
     pub lon: Option<f64>,
+    /// How high the photo was taken, in metres above the WGS84 ellipsoid or above whatever the map
+    /// measures from throughout.
+    #[schema(minimum = -12000, maximum = 100000)]
+    #[param(minimum = -12000, maximum = 100000, example = 83.5)]
+    pub alt: Option<f64>,
     /// Where the camera looked, in degrees clockwise from north.
     #[schema(minimum = -360, maximum = 360)]
     #[param(minimum = -360, maximum = 360, example = 270)]
@@ -84,8 +89,8 @@ pub struct ReferenceParams {
     #[param(value_type = Option<String>, example = "{\"camera\":\"left\"}")]
     #[serde(default, deserialize_with = "metadata")]
     pub metadata: Option<Metadata>,
-    /// Whether position, heading and time are read from the photo's EXIF and XMP where the request
-    /// gives none. A time without an offset from UTC is then taken as UTC. By default they are.
+    /// Whether position, height, heading and time are read from the photo's EXIF and XMP where the
+    /// request gives none. A time without an offset from UTC is then taken as UTC. By default they are.
     #[schema(default = true)]
     #[param(example = true)]
     pub exif: Option<bool>,
@@ -109,6 +114,7 @@ impl ReferenceParams {
         let fields = ReferenceFields {
             external_id: self.external_id,
             location: point(self.lat, self.lon)?,
+            alt: self.alt.map(Altitude::new).transpose()?,
             heading: self.heading.map(Heading::new).transpose()?,
             captured_at: self.captured_at,
             metadata: self.metadata,
@@ -121,8 +127,8 @@ impl ReferenceParams {
 ///
 /// Acknowledged only after it is durable and can be found. The image is the raw body with the
 /// fields as query parameters, or a multipart part `image` beside a part `json`, or base64 in JSON
-/// beside the fields. Position, heading and time that the request leaves out are taken from the
-/// photo's own EXIF or XMP, unless `exif` is false; `sources` says where each comes from.
+/// beside the fields. Position, height, heading and time that the request leaves out are taken from
+/// the photo's own EXIF or XMP, unless `exif` is false; `sources` says where each comes from.
 ///
 /// A photo that shows nothing by which a place could be known is refused, unless
 /// `allow_uninformative` is true.
@@ -356,6 +362,10 @@ pub struct ReferenceChange {
     #[schema(minimum = -180, maximum = 180, value_type = Option<f64>)]
     #[serde(default, deserialize_with = "present")]
     lon: Option<Option<f64>>,
+    /// Metres above the WGS84 ellipsoid, or above what the map measures from.
+    #[schema(minimum = -12000, maximum = 100000, value_type = Option<f64>)]
+    #[serde(default, deserialize_with = "present")]
+    alt: Option<Option<f64>>,
     /// Degrees clockwise from north.
     #[schema(minimum = -360, maximum = 360, value_type = Option<f64>)]
     #[serde(default, deserialize_with = "present")]
@@ -381,15 +391,15 @@ impl ReferenceChange {
                 ));
             }
         };
-        let heading = match self.heading {
-            None => None,
-            Some(None) => Some(None),
-            Some(Some(degrees)) => Some(Some(Heading::new(degrees)?)),
-        };
+        let alt = self.alt.map(|alt| alt.map(Altitude::new).transpose());
+        let heading = self
+            .heading
+            .map(|degrees| degrees.map(Heading::new).transpose());
         Ok(ReferencePatch {
             external_id: self.external_id,
             location,
-            heading,
+            alt: alt.transpose()?,
+            heading: heading.transpose()?,
             captured_at: self.captured_at,
             metadata: self.metadata,
         })

@@ -7,7 +7,7 @@ use crate::http::state::AppState;
 use crate::pipeline::{FieldSource, FieldSources, Timings};
 use axum::http::{HeaderName, HeaderValue, StatusCode};
 use axum::response::Response;
-use placeformer_core::types::{GeoPoint, Heading, Metadata, Reference, Timestamp};
+use placeformer_core::types::{Altitude, GeoPoint, Heading, Metadata, Reference, Timestamp};
 use serde::de::value::MapAccessDeserializer;
 use serde::de::{Error, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
@@ -35,6 +35,8 @@ pub struct LocationBody {
     pub lat: Option<f64>,
     /// Longitude in degrees; null on an indoor map.
     pub lon: Option<f64>,
+    /// Metres above the WGS84 ellipsoid, or above what the map's builder measures from.
+    pub alt: Option<f64>,
     /// Degrees clockwise from north.
     pub heading: Option<f64>,
 }
@@ -98,6 +100,8 @@ pub struct NewReferenceBody {
 pub struct SourcesBody {
     /// That of latitude and longitude.
     location: Option<SourceName>,
+    /// That of the height.
+    alt: Option<SourceName>,
     /// That of the heading.
     heading: Option<SourceName>,
     /// That of the time.
@@ -137,6 +141,7 @@ impl NewReferenceBody {
             reference: reference.into(),
             sources: SourcesBody {
                 location: sources.location.map(Into::into),
+                alt: sources.alt.map(Into::into),
                 heading: sources.heading.map(Into::into),
                 captured_at: sources.captured_at.map(Into::into),
             },
@@ -144,16 +149,18 @@ impl NewReferenceBody {
     }
 }
 
-/// Location and heading of a reference, if it has either.
+/// Location, height and heading of a reference, if it has any of them.
 pub fn location(reference: &Reference) -> Option<LocationBody> {
     let point = reference.fields.location;
     let heading = reference.fields.heading;
-    if point.is_none() && heading.is_none() {
+    let alt = reference.fields.alt;
+    if point.is_none() && heading.is_none() && alt.is_none() {
         return None;
     }
     Some(LocationBody {
         lat: point.map(GeoPoint::lat),
         lon: point.map(GeoPoint::lon),
+        alt: alt.map(Altitude::metres),
         heading: heading.map(Heading::degrees),
     })
 }

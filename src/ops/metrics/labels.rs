@@ -15,19 +15,22 @@ pub enum PipelineStage {
     Load,
     /// Matching and verification.
     Rerank,
+    /// What a track expects, and what is believed of it after the photo.
+    Track,
     /// Writing to the store, until it is durable.
     Commit,
 }
 
 impl PipelineStage {
     /// All stages in the order of the data.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::Decode,
         Self::Queue,
         Self::Extract,
         Self::Search,
         Self::Load,
         Self::Rerank,
+        Self::Track,
         Self::Commit,
     ];
 
@@ -40,6 +43,7 @@ impl PipelineStage {
             Self::Search => "search",
             Self::Load => "load",
             Self::Rerank => "rerank",
+            Self::Track => "track",
             Self::Commit => "commit",
         }
     }

@@ -239,6 +239,11 @@ impl Metrics {
         series.with_label_values(&[kind.as_str()]).inc();
     }
 
+    /// A vehicle whose place was known is at no known place any more.
+    pub fn track_lost(&self) {
+        self.queries.tracks_lost.inc();
+    }
+
     /// So many damaged records were found that had not been found before.
     pub fn corrupt_records(&self, records: u64) {
         self.corrupt_records.inc_by(records);
@@ -382,6 +387,7 @@ impl RequestSeries {
 struct QuerySeries {
     top1_score: Histogram,
     unmatched: IntCounter,
+    tracks_lost: IntCounter,
 }
 
 impl QuerySeries {
@@ -395,6 +401,10 @@ impl QuerySeries {
             unmatched: series.counter(
                 "query_unmatched_total",
                 "Queries whose best answer is not trusted.",
+            )?,
+            tracks_lost: series.counter(
+                "tracks_lost_total",
+                "Tracks that came from a known place to none.",
             )?,
         })
     }
@@ -516,6 +526,7 @@ mod tests {
             "placeformer_query_top1_score_count 0",
             "placeformer_query_unmatched_total 0",
             "placeformer_uninformative_images_total{kind=\"query\"} 0",
+            "placeformer_tracks_lost_total 0",
             "placeformer_log_lines_dropped_total 0",
             "placeformer_rejected_total{reason=\"storage_lost\"} 0",
             "placeformer_build_info{version=",

@@ -6,6 +6,6 @@ mod utm_name;
 mod utm_zone;
 
 pub use named_position::NamedPosition;
-pub use position::{GeoCircle, GeoPoint, Heading};
+pub use position::{Altitude, GeoCircle, GeoPoint, Heading};
 pub use utm_name::UtmName;
 pub use utm_zone::{MetricPoint, UtmZone};

@@ -138,6 +138,49 @@ impl From<Heading> for f64 {
     }
 }
 
+/// A height in metres, above the WGS84 ellipsoid or above whatever else a map's builder measures
+/// from; finite and in range by construction.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "f64", into = "f64")]
+pub struct Altitude(f64);
+
+impl Altitude {
+    /// Below the deepest sea, and above whatever flies.
+    const RANGE: std::ops::RangeInclusive<f64> = -12_000.0..=100_000.0;
+
+    /// Accepts -12,000 to 100,000 metres.
+    pub fn new(metres: f64) -> Result<Self, InvalidValue> {
+        // NaN is in no range.
+        if Self::RANGE.contains(&metres) {
+            // There is no minus zero, as in a position.
+            return Ok(Self(metres + 0.0));
+        }
+        let (lowest, highest) = (Self::RANGE.start(), Self::RANGE.end());
+        Err(InvalidValue::new(
+            "alt",
+            format!("{metres} is outside {lowest} to {highest} metres"),
+        ))
+    }
+
+    /// Metres.
+    pub fn metres(self) -> f64 {
+        self.0
+    }
+}
+
+impl TryFrom<f64> for Altitude {
+    type Error = InvalidValue;
+    fn try_from(metres: f64) -> Result<Self, Self::Error> {
+        Self::new(metres)
+    }
+}
+
+impl From<Altitude> for f64 {
+    fn from(altitude: Altitude) -> Self {
+        altitude.0
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -177,6 +220,14 @@ mod tests {
         let west = GeoPoint::new(0.0, 179.9995).unwrap();
         let east = GeoPoint::new(0.0, -179.9995).unwrap();
         assert!((west.distance_m(east) - 111.195).abs() < 0.1);
+    }
+
+    #[test]
+    fn altitudes_out_of_range_or_not_finite_are_refused() {
+        for metres in [-12_001.0, 1e6, f64::NAN, f64::INFINITY] {
+            assert!(Altitude::new(metres).is_err(), "{metres}");
+        }
+        assert!(Altitude::new(-0.0).unwrap().metres().is_sign_positive());
     }
 
     #[test]

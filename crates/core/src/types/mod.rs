@@ -11,7 +11,7 @@ mod metadata;
 mod reference;
 mod timestamp;
 
-pub use crate::geography::{GeoCircle, GeoPoint, Heading};
+pub use crate::geography::{Altitude, GeoCircle, GeoPoint, Heading};
 pub use crate::invalid::{InvalidName, InvalidValue};
 pub use calibration::{Calibration, ConfidenceCurve, ConfidenceWeights};
 pub use deadline::Deadline;

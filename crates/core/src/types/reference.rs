@@ -4,7 +4,7 @@ use super::descriptor::Descriptor;
 use super::ids::{ContentHash, ExternalId, MapName, ModelId, ReferenceId};
 use super::metadata::Metadata;
 use super::timestamp::Timestamp;
-use crate::geography::{GeoCircle, GeoPoint, Heading};
+use crate::geography::{Altitude, GeoCircle, GeoPoint, Heading};
 
 /// What the map builder says about a photo.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -13,6 +13,8 @@ pub struct ReferenceFields {
     pub external_id: Option<ExternalId>,
     /// Where it was taken; absent on indoor maps.
     pub location: Option<GeoPoint>,
+    /// How high it was taken.
+    pub alt: Option<Altitude>,
     /// Where the camera looked.
     pub heading: Option<Heading>,
     /// When it was taken.

@@ -131,6 +131,8 @@ impl ReadPlaces for FilledStore {
                     reference: entry.id,
                     global: entry.global,
                     location: entry.location,
+                    alt: entry.alt,
+                    heading: entry.heading,
                     captured_at: entry.captured_at,
                 });
             }

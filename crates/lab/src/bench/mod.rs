@@ -8,7 +8,8 @@
 //! | [`scenes`], `streets` | the inputs: a drawn photo, key patches with planted inliers, a map |
 //! | [`baselines`] | the plain implementations |
 //! | `context`, `rows` | what all measurements share; from a name to its measurement |
-//! | `decode`, `extract`, `search`, `query`, `candidates`, `ingest`, `rehead` | the measurements |
+//! | `decode`, `extract`, `search`, `candidates`, `track`, `query` | the measurements of queries |
+//! | `ingest`, `rehead` | those of maps |
 //! | [`filled`] | a store that shows more references than it holds |
 //! | `service` | the whole service, which the caller passes in |
 //!
@@ -33,6 +34,7 @@ pub mod scenes;
 mod search;
 mod service;
 mod streets;
+mod track;
 
 pub use candidates::store_scene;
 pub use context::Bench;

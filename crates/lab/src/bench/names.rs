@@ -2,7 +2,7 @@
 
 /// The rows there are, in the order they are measured. `search_10m` takes 14 GB and runs only when
 /// it is named.
-pub const NAMES: [&str; 19] = [
+pub const NAMES: [&str; 20] = [
     "decode_resize_1080p",
     "extract",
     "extract_batch8",
@@ -18,6 +18,7 @@ pub const NAMES: [&str; 19] = [
     "search_100k",
     "search_1m",
     "search_10m",
+    "track_1m",
     "query_1m",
     "commit",
     "ingest",

@@ -27,6 +27,7 @@ impl Bench<'_> {
             "search_100k" => self.search("search_100k", 100_000),
             "search_1m" => self.search("search_1m", 1_000_000),
             "search_10m" => self.search("search_10m", 10_000_000),
+            "track_1m" => self.track(),
             "query_1m" => self.query(),
             "commit" => self.commit(),
             "ingest" => self.ingest(),

@@ -63,6 +63,8 @@ pub fn index_entry(number: u64) -> IndexEntry {
         id: made_up_id(number),
         global: unit_vector(number),
         location,
+        alt: None,
+        heading: None,
         captured_at: None,
     }
 }

@@ -64,7 +64,7 @@ impl Bench<'_> {
 }
 
 /// An index of `size` random references, and the first `copied` vectors once more.
-fn random_index(size: u64, copied: u64) -> (MapIndex, Vec<f32>) {
+pub(super) fn random_index(size: u64, copied: u64) -> (MapIndex, Vec<f32>) {
     let entries: Vec<IndexEntry> = (0..size).into_par_iter().map(index_entry).collect();
     let vectors = entries[..copied as usize]
         .iter()

@@ -161,6 +161,7 @@ impl Prepared {
             recall: Both {
                 global: recall(dataset, answers, Answer::global_ranking),
                 reranked: Some(recall(dataset, answers, Answer::reranked_ranking)),
+                tracked: None,
             },
             extract_seconds: self.database.seconds.extract,
             rerank_seconds: measured.rerank_seconds,

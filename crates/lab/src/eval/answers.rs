@@ -6,7 +6,7 @@ use super::own_places::OwnPlaces;
 use super::run::{Answer, QuerySeconds, rerank_all, search_all};
 use crate::datasets::Dataset;
 use placeformer_core::progress::{Progress, Task};
-use placeformer_vision::rerank::RerankConfig;
+use placeformer_vision::rerank::{PairScore, RerankConfig, Reranker};
 
 /// Both sides of a data set, described.
 pub struct DescribedDataset {
@@ -97,6 +97,48 @@ impl DescribedDataset {
             left_out,
             seconds,
         })
+    }
+
+    /// Compares a query with references that its search did not find, each alone: their indices,
+    /// global distances and, with a configuration of re-ranking, scores. Images that cannot be read
+    /// are left out.
+    ///
+    /// # Errors
+    /// Key patches cannot be read from the cache.
+    pub fn compare(
+        &self,
+        query: usize,
+        references: &[usize],
+        rerank: Option<&RerankConfig>,
+    ) -> Result<Vec<(usize, f32, Option<PairScore>)>, EvalError> {
+        let Some(global) = self.queries.global(query) else {
+            return Ok(Vec::new());
+        };
+        let mut compared = Vec::with_capacity(references.len());
+        for &index in references {
+            let Some(other) = self.database.global(index) else {
+                continue;
+            };
+            let squares = global.iter().zip(other).map(|(a, b)| (a - b) * (a - b));
+            let distance = squares.sum::<f32>().sqrt();
+            let score = match rerank {
+                Some(config) => Some(self.score(query, index, config)?),
+                None => None,
+            };
+            compared.push((index, distance, score));
+        }
+        Ok(compared)
+    }
+
+    fn score(
+        &self,
+        query: usize,
+        reference: usize,
+        config: &RerankConfig,
+    ) -> Result<PairScore, EvalError> {
+        let query = self.cache.patches(&self.queries, query)?;
+        let reference = self.cache.patches(&self.database, reference)?;
+        Ok(Reranker::new(config.clone()).score(&query, &reference))
     }
 
     fn rerank(

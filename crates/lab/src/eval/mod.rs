@@ -6,6 +6,7 @@
 //! | [`run`] | search and re-ranking of every query, as the service does them |
 //! | [`answers`] | both of these for a whole data set |
 //! | [`own_places`] | what is left out of the database to make a query one without a match |
+//! | [`sequences`] | the same with tracks: queries as the frames of a drive |
 //! | [`measure`] | the numbers, as pure functions |
 //! | [`summary`], [`mod@summarise`] | all numbers of a run as one value, and how it is made |
 //! | [`calibrate`] | from answers to how far they can be trusted |
@@ -25,6 +26,7 @@ mod places;
 pub mod prediction;
 pub mod report;
 pub mod run;
+pub mod sequences;
 pub mod summarise;
 pub mod summary;
 

@@ -178,6 +178,8 @@ impl<'f> Searcher<'f> {
                 id: id_of(index),
                 global,
                 location: None,
+                alt: None,
+                heading: None,
                 captured_at: None,
             })
         };

@@ -62,6 +62,7 @@ pub fn summarise(
         calibration: fitted_here(&best, config.seed),
         shipped_calibration: shipped_here(&best, &config),
         given_calibration: given.and_then(|given| given_here(&best, given, view.reranked)),
+        sequences: None,
         seconds: Seconds {
             decode: database.seconds.decode,
             extract: database.seconds.extract,

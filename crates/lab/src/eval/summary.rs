@@ -4,6 +4,7 @@ use super::calibrate::Applied;
 use super::error::EvalError;
 use super::features::{GlobalKind, Unreadable};
 use super::measure::{Interval, PoseAccuracy, Rejection, ReliabilityBin};
+use super::sequences::SequenceSummary;
 use crate::datasets::Skipped;
 use placeformer_core::types::{Calibration, ConfidenceWeights, ModelId};
 use placeformer_vision::extract::ExtractConfig;
@@ -19,6 +20,10 @@ pub struct Both<T> {
     /// By S; absent if nothing was re-ranked.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reranked: Option<T>,
+    /// By all that is known of a vehicle whose frames the queries are; absent if they were not
+    /// followed as sequences.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tracked: Option<T>,
 }
 
 impl<T> Both<T> {
@@ -27,6 +32,7 @@ impl<T> Both<T> {
         Self {
             global: value(RankedBy::Distance),
             reranked: reranked.then(|| value(RankedBy::Score)),
+            tracked: None,
         }
     }
 }
@@ -185,6 +191,9 @@ pub struct Summary {
     /// The same of a calibration that was given to be judged.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub given_calibration: Option<Applied>,
+    /// What tracks come to, if the queries were followed as sequences.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sequences: Option<SequenceSummary>,
     /// Mean seconds per image and per query.
     pub seconds: Seconds,
     /// Mean bytes of one reference.

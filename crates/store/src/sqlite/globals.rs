@@ -61,6 +61,8 @@ impl GlobalColumns {
             reference: columns.id(),
             global: parts::read_global(version, columns.number, vector, checksum)?,
             location: columns.location()?,
+            alt: columns.alt()?,
+            heading: columns.heading()?,
             captured_at: columns.captured_at()?,
         })
     }

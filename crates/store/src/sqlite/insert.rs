@@ -227,6 +227,7 @@ fn reference_row(new: &Prepared, map: &MapRow, number: ReferenceNumber) -> Refer
         external_id: None,
         lat: None,
         lon: None,
+        alt: None,
         heading: None,
         captured_at: None,
         metadata: None,

@@ -23,6 +23,10 @@ const MIGRATIONS: &[(&str, &str)] = &[
         "commit_count",
         include_str!("../../../../migrations/sqlite/0003_commit_count.sql"),
     ),
+    (
+        "altitude",
+        include_str!("../../../../migrations/sqlite/0004_altitude.sql"),
+    ),
 ];
 
 const HISTORY: &str = "CREATE TABLE IF NOT EXISTS schema_migration (

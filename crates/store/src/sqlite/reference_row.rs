@@ -6,14 +6,14 @@ use super::keys::{MapNumber, ReferenceNumber};
 use super::row::{RowError, from_micros, id_or_zeros, verify};
 use crate::error::StoreError;
 use placeformer_core::types::{
-    ContentHash, ExternalId, GeoPoint, Heading, MapName, Metadata, ModelId, Reference,
+    Altitude, ContentHash, ExternalId, GeoPoint, Heading, MapName, Metadata, ModelId, Reference,
     ReferenceFields, ReferenceId, Timestamp,
 };
 use rusqlite::{Connection, OptionalExtension, Row, Statement, named_params};
 
 /// What a statement selects from [`REFERENCE_SOURCE`] for [`ReferenceColumns`].
 pub(super) const REFERENCE_COLUMNS: &str = "r.number AS number, r.id AS id, r.map AS map, \
-     r.external_id AS external_id, r.lat AS lat, r.lon AS lon, r.heading AS heading, \
+     r.external_id AS external_id, r.lat AS lat, r.lon AS lon, r.alt AS alt, r.heading AS heading, \
      r.captured_at AS captured_at, r.metadata AS metadata, r.content_hash AS content_hash, \
      r.created_at AS created_at, r.checksum AS checksum, m.name AS map_name, m.model AS map_model";
 
@@ -32,6 +32,7 @@ pub(super) struct ReferenceColumns {
     external_id: usize,
     lat: usize,
     lon: usize,
+    alt: usize,
     heading: usize,
     captured_at: usize,
     metadata: usize,
@@ -52,6 +53,7 @@ impl ReferenceColumns {
             external_id: statement.column_index("external_id")?,
             lat: statement.column_index("lat")?,
             lon: statement.column_index("lon")?,
+            alt: statement.column_index("alt")?,
             heading: statement.column_index("heading")?,
             captured_at: statement.column_index("captured_at")?,
             metadata: statement.column_index("metadata")?,
@@ -87,6 +89,7 @@ impl ReferenceColumns {
             external_id: row.get(self.external_id)?,
             lat: row.get(self.lat)?,
             lon: row.get(self.lon)?,
+            alt: row.get(self.alt)?,
             heading: row.get(self.heading)?,
             captured_at: row.get(self.captured_at)?,
             metadata: row.get(self.metadata)?,
@@ -116,6 +119,7 @@ pub(super) struct ReferenceRow {
     pub external_id: Option<String>,
     pub lat: Option<f64>,
     pub lon: Option<f64>,
+    pub alt: Option<f64>,
     pub heading: Option<f64>,
     pub captured_at: Option<i64>,
     pub metadata: Option<String>,
@@ -129,13 +133,15 @@ impl ReferenceRow {
         self.external_id = fields.external_id.as_ref().map(|id| id.as_str().to_owned());
         self.lat = fields.location.map(GeoPoint::lat);
         self.lon = fields.location.map(GeoPoint::lon);
+        self.alt = fields.alt.map(Altitude::metres);
         self.heading = fields.heading.map(Heading::degrees);
         self.captured_at = fields.captured_at.map(Timestamp::unix_micros);
         self.metadata = fields.metadata.as_ref().map(Metadata::to_string);
     }
 
+    /// Rows from before there were heights have none, and the checksum that they always had.
     pub(super) fn checksum(&self) -> i64 {
-        RowChecksum::of("reference")
+        let sum = RowChecksum::of("reference")
             .integer(self.number.value())
             .bytes(&self.id)
             .integer(self.map.value())
@@ -146,8 +152,11 @@ impl ReferenceRow {
             .optional(self.captured_at.map(i64::to_le_bytes))
             .optional(self.metadata.as_ref())
             .bytes(&self.content_hash)
-            .integer(self.created_at)
-            .finish()
+            .integer(self.created_at);
+        match self.alt {
+            Some(alt) => sum.optional(Some(alt.to_le_bytes())).finish(),
+            None => sum.finish(),
+        }
     }
 
     pub(super) fn id(&self) -> ReferenceId {
@@ -164,6 +173,16 @@ impl ReferenceRow {
         }
     }
 
+    pub(super) fn alt(&self) -> Result<Option<Altitude>, RowError> {
+        let alt = self.alt.map(Altitude::new).transpose();
+        alt.map_err(RowError::damaged)
+    }
+
+    pub(super) fn heading(&self) -> Result<Option<Heading>, RowError> {
+        let heading = self.heading.map(Heading::new).transpose();
+        heading.map_err(RowError::damaged)
+    }
+
     pub(super) fn captured_at(&self) -> Result<Option<Timestamp>, RowError> {
         self.captured_at.map(from_micros).transpose()
     }
@@ -173,10 +192,6 @@ impl ReferenceRow {
             Some(text) => Some(text.parse().map_err(RowError::damaged)?),
             None => None,
         };
-        let heading = match self.heading {
-            Some(degrees) => Some(Heading::new(degrees).map_err(RowError::damaged)?),
-            None => None,
-        };
         let metadata = match &self.metadata {
             Some(text) => Some(Metadata::from_stored(text.clone()).map_err(RowError::damaged)?),
             None => None,
@@ -184,7 +199,8 @@ impl ReferenceRow {
         Ok(ReferenceFields {
             external_id,
             location: self.location()?,
-            heading,
+            alt: self.alt()?,
+            heading: self.heading()?,
             captured_at: self.captured_at()?,
             metadata,
         })
@@ -209,12 +225,12 @@ impl ReferenceRow {
     /// Writes the row, replacing the one with its number.
     pub(super) fn write(&self, connection: &Connection) -> rusqlite::Result<()> {
         let mut statement = connection.prepare_cached(
-            "INSERT INTO reference (number, id, map, external_id, lat, lon, heading, captured_at,
-                                    metadata, content_hash, created_at, checksum)
-             VALUES (:number, :id, :map, :external_id, :lat, :lon, :heading, :captured_at,
+            "INSERT INTO reference (number, id, map, external_id, lat, lon, alt, heading,
+                                    captured_at, metadata, content_hash, created_at, checksum)
+             VALUES (:number, :id, :map, :external_id, :lat, :lon, :alt, :heading, :captured_at,
                      :metadata, :content_hash, :created_at, :checksum)
              ON CONFLICT (number) DO UPDATE SET external_id = :external_id, lat = :lat, lon = :lon,
-                 heading = :heading, captured_at = :captured_at, metadata = :metadata,
+                 alt = :alt, heading = :heading, captured_at = :captured_at, metadata = :metadata,
                  checksum = :checksum",
         )?;
         statement.execute(named_params! {
@@ -224,6 +240,7 @@ impl ReferenceRow {
             ":external_id": self.external_id,
             ":lat": self.lat,
             ":lon": self.lon,
+            ":alt": self.alt,
             ":heading": self.heading,
             ":captured_at": self.captured_at,
             ":metadata": self.metadata,
@@ -348,4 +365,48 @@ pub(super) fn reference_by_number(
     number: ReferenceNumber,
 ) -> Result<Option<Reference>, RowError> {
     read_by_number(connection, number, ReferenceColumns::read_reference)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_from_before_there_were_heights_keep_their_checksum() {
+        let row = ReferenceRow {
+            number: ReferenceNumber::BEFORE_ALL,
+            id: [1; 16],
+            map: MapNumber::UNKNOWN,
+            external_id: None,
+            lat: Some(1.0),
+            lon: Some(2.0),
+            alt: None,
+            heading: None,
+            captured_at: None,
+            metadata: None,
+            content_hash: [2; 32],
+            created_at: 3,
+        };
+        // What the first release summed up.
+        let nothing: Option<[u8; 8]> = None;
+        let first_release = RowChecksum::of("reference")
+            .integer(row.number.value())
+            .bytes(&row.id)
+            .integer(row.map.value())
+            .optional(nothing)
+            .optional(Some(1.0f64.to_le_bytes()))
+            .optional(Some(2.0f64.to_le_bytes()))
+            .optional(nothing)
+            .optional(nothing)
+            .optional(nothing)
+            .bytes(&row.content_hash)
+            .integer(row.created_at)
+            .finish();
+        assert_eq!(row.checksum(), first_release);
+        let high = ReferenceRow {
+            alt: Some(0.0),
+            ..row
+        };
+        assert_ne!(high.checksum(), first_release);
+    }
 }

@@ -238,6 +238,8 @@ impl PooledColumns {
                 reference: columns.id(),
                 global: Vec::new(),
                 location: columns.location()?,
+                alt: columns.alt()?,
+                heading: columns.heading()?,
                 captured_at: columns.captured_at()?,
             }),
         })

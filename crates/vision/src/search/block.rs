@@ -79,7 +79,7 @@ impl Block {
         self.errors.push(quantised.error);
         self.squares.push(quantised.square);
         self.vectors.extend_from_slice(&entry.global);
-        let place = PlaceAndTime::new(entry.location, entry.captured_at);
+        let place = PlaceAndTime::of(entry);
         self.places.push(place);
         self.extent.add(&place);
         self.longest = self.longest.max(quantised.length_bound());

@@ -127,6 +127,8 @@ mod tests {
             id,
             global,
             location: None,
+            alt: None,
+            heading: None,
             captured_at: None,
         }
     }

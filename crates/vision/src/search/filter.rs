@@ -5,7 +5,10 @@
 //! the box is outside the circle; and if the ranges of a whole block of references do not overlap
 //! the box, none of its rows has to be looked at.
 
-use placeformer_core::types::{GeoCircle, GeoPoint, ReferenceFilter, Timestamp};
+use super::entry::{IndexEntry, LocatedReference};
+use placeformer_core::types::{
+    Altitude, GeoCircle, GeoPoint, Heading, ReferenceFilter, ReferenceId, Timestamp,
+};
 
 /// Smaller than any radius of the Earth that is in use, so that boxes are never too small.
 const SMALL_EARTH_RADIUS_M: f64 = 6_350_000.0;
@@ -13,13 +16,17 @@ const SMALL_EARTH_RADIUS_M: f64 = 6_350_000.0;
 /// Degrees by which a box is widened on every side against rounding: about 10 cm.
 const MARGIN_DEGREES: f64 = 1e-6;
 
-/// Where and when one reference was taken, in 32 bytes.
+/// Where, in which direction and when one reference was taken, in 40 bytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct PlaceAndTime {
     /// Degrees; NaN if there is no location. Comparisons with NaN are false, so such a reference is
     /// outside every box.
-    lat: f64,
+    pub(super) lat: f64,
     lon: f64,
+    /// Metres; NaN if there is no height.
+    alt: f32,
+    /// Degrees; NaN if there is no heading.
+    heading: f32,
     captured_at: Option<Timestamp>,
 }
 
@@ -29,8 +36,31 @@ impl PlaceAndTime {
         Self {
             lat,
             lon,
+            alt: f32::NAN,
+            heading: f32::NAN,
             captured_at,
         }
+    }
+
+    /// The place of an entry of the index.
+    pub(super) fn of(entry: &IndexEntry) -> Self {
+        Self {
+            alt: entry.alt.map_or(f32::NAN, |alt| alt.metres() as f32),
+            heading: entry
+                .heading
+                .map_or(f32::NAN, |heading| heading.degrees() as f32),
+            ..Self::new(entry.location, entry.captured_at)
+        }
+    }
+
+    /// The reference `id`, which was taken here; `None` if there is no location.
+    pub(super) fn located(&self, id: ReferenceId) -> Option<LocatedReference> {
+        Some(LocatedReference {
+            id,
+            location: self.location()?,
+            alt: Altitude::new(f64::from(self.alt)).ok(),
+            heading: Heading::new(f64::from(self.heading)).ok(),
+        })
     }
 
     fn location(&self) -> Option<GeoPoint> {
@@ -73,16 +103,16 @@ impl Extent {
 
 /// A box of latitudes and longitudes around a circle, in degrees.
 #[derive(Debug, Clone, Copy)]
-struct BoundingBox {
+pub(super) struct BoundingBox {
     /// South and north.
-    lat: (f64, f64),
+    pub(super) lat: (f64, f64),
     centre_lon: f64,
     /// Half the width; 180 if the circle contains a pole.
     half_lon: f64,
 }
 
 impl BoundingBox {
-    fn around(circle: &GeoCircle) -> Self {
+    pub(super) fn around(circle: &GeoCircle) -> Self {
         let lat = circle.centre.lat();
         let angle = circle.radius_m / SMALL_EARTH_RADIUS_M;
         let half_lat = angle.to_degrees() + MARGIN_DEGREES;
@@ -103,7 +133,7 @@ impl BoundingBox {
         }
     }
 
-    fn contains(&self, lat: f64, lon: f64) -> bool {
+    pub(super) fn contains(&self, lat: f64, lon: f64) -> bool {
         let (south, north) = self.lat;
         let difference = (lon - self.centre_lon).abs();
         // The shorter way around the Earth.
@@ -112,7 +142,7 @@ impl BoundingBox {
     }
 
     /// Whether some point within `extent` may be in the box.
-    fn may_overlap(&self, extent: &Extent) -> bool {
+    pub(super) fn may_overlap(&self, extent: &Extent) -> bool {
         let (south, north) = self.lat;
         let overlaps_lat = extent.lat.1 >= south && extent.lat.0 <= north;
         let west = self.centre_lon - self.half_lon;

@@ -1,14 +1,15 @@
 //! The index of one map: searched and changed at the same time.
 
 use super::block::{Block, CAPACITY};
-use super::entry::{IndexEntry, Neighbour};
+use super::entry::{IndexEntry, LocatedReference, Neighbour};
 use super::filter::PreparedFilter;
 use super::list::BlockList;
-use super::nearest::Nearest;
+use super::near::{Circles, thinned};
+use super::nearest::{Nearest, squared_distance};
 use super::quantised::QuantisedVector;
 use super::scan::{Candidates, Query};
 use super::sealed::SealedBlock;
-use placeformer_core::types::{GLOBAL_DIM, ReferenceFilter, ReferenceId};
+use placeformer_core::types::{GLOBAL_DIM, GeoCircle, ReferenceFilter, ReferenceId};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
@@ -99,11 +100,63 @@ impl MapIndex {
     /// The global descriptor of a reference, `[256]`; `None` if it is not there.
     pub fn global(&self, id: ReferenceId) -> Option<Vec<f32>> {
         let state = self.read();
-        let vector = match state.tail_rows.get(&id) {
-            Some(&row) => state.tail.vector(row as usize),
-            None => state.sealed.vector(id)?,
+        let (block, row) = state.row(id)?;
+        Some(block.vector(row).to_vec())
+    }
+
+    /// Where each of these references was taken; `None` for one that has no location or is not
+    /// there.
+    pub fn located(&self, ids: &[ReferenceId]) -> Vec<Option<LocatedReference>> {
+        let state = self.read();
+        let located = |&id: &ReferenceId| {
+            let (block, row) = state.row(id)?;
+            block.places[row].located(id)
         };
-        Some(vector.to_vec())
+        ids.iter().map(located).collect()
+    }
+
+    /// These references with their distances to `query` (`[256]`), without those that are not
+    /// there.
+    ///
+    /// # Panics
+    /// If the query's length is not 256.
+    pub fn compare(&self, query: &[f32], ids: &[ReferenceId]) -> Vec<Neighbour> {
+        assert_eq!(query.len(), GLOBAL_DIM, "length of a query");
+        let state = self.read();
+        let compare = |&id: &ReferenceId| {
+            let (block, row) = state.row(id)?;
+            let distance = squared_distance(query, block.vector(row)).sqrt();
+            Some(Neighbour { id, distance })
+        };
+        ids.iter().filter_map(compare).collect()
+    }
+
+    /// The references in any of these circles that pass `filter`, by ascending id. Where there are
+    /// more than `limit`, as many of them, spread over the map.
+    pub fn near(
+        &self,
+        circles: &[GeoCircle],
+        filter: &ReferenceFilter,
+        limit: usize,
+    ) -> Vec<LocatedReference> {
+        let circles = Circles::new(circles);
+        let filter = PreparedFilter::new(filter);
+        let (mut found, sealed) = {
+            let state = self.read();
+            let in_tail = circles.collect(&state.tail, &filter, |_| true, limit);
+            (in_tail, state.sealed.clone())
+        };
+        let in_block = |number: usize| {
+            let block = sealed.get(number)?;
+            Some(circles.collect(&block.block, &filter, |row| block.is_live(row), limit))
+        };
+        let in_sealed: Vec<Vec<LocatedReference>> = (0..sealed.end())
+            .into_par_iter()
+            .with_min_len(BLOCKS_PER_TASK)
+            .filter_map(in_block)
+            .collect();
+        found.extend(in_sealed.into_iter().flatten());
+        thinned(found, limit)
     }
 
     /// The `k` references nearest to `query` (`[256]`) that pass `filter`: nearest first, equally
@@ -202,6 +255,14 @@ fn scan_sealed(query: &Query<'_>, sealed: &BlockList) -> Candidates {
 }
 
 impl State {
+    /// The block and the row of a reference.
+    fn row(&self, id: ReferenceId) -> Option<(&Block, usize)> {
+        match self.tail_rows.get(&id) {
+            Some(&row) => Some((&self.tail, row as usize)),
+            None => self.sealed.row(id),
+        }
+    }
+
     fn insert(&mut self, entry: &IndexEntry, quantised: QuantisedVector) {
         if self.highest.is_none_or(|highest| entry.id > highest) {
             self.highest = Some(entry.id);

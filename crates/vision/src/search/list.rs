@@ -151,10 +151,10 @@ impl BlockList {
         &group.blocks[number % GROUP].block
     }
 
-    /// The descriptor of a reference, `[256]`; `None` if it is not there or removed.
-    pub(super) fn vector(&self, id: ReferenceId) -> Option<&[f32]> {
+    /// The block and the row of a reference; `None` if it is not there or removed.
+    pub(super) fn row(&self, id: ReferenceId) -> Option<(&Block, usize)> {
         let found = self.find(id)?;
-        Some(self.at(found.block).block.vector(found.row))
+        Some((&self.at(found.block).block, found.row))
     }
 
     /// Removes a reference; false if it is not there.
@@ -269,6 +269,8 @@ mod tests {
             id: id(number),
             global: vec![number as f32; GLOBAL_DIM],
             location: None,
+            alt: None,
+            heading: None,
             captured_at: None,
         };
         SealedBlock::new(Block::of(numbers.map(entry)))
@@ -282,7 +284,9 @@ mod tests {
 
     fn check(list: &BlockList, there: impl Fn(usize) -> bool, end: usize) {
         for number in 0..end {
-            let found = list.vector(id(number)).map(|vector| vector[0]);
+            let found = list
+                .row(id(number))
+                .map(|(block, row)| block.vector(row)[0]);
             assert_eq!(found, there(number).then_some(number as f32), "{number}");
         }
         let blocks: Vec<&SealedBlock> = (0..list.end())
@@ -306,7 +310,7 @@ mod tests {
         let mut removed = Vec::new();
         for step in [3, 2, 5, 1] {
             for number in (0..end).step_by(step) {
-                let there = list.vector(id(number)).is_some();
+                let there = list.row(id(number)).is_some();
                 assert_eq!(list.remove(id(number)), there);
                 assert!(!list.remove(id(number)));
             }
@@ -326,8 +330,8 @@ mod tests {
         let before = list.clone();
         assert!(list.remove(id(5)));
         list.push(sealed(9_000..9_001));
-        assert!(before.vector(id(5)).is_some() && before.vector(id(9_000)).is_none());
-        assert!(list.vector(id(5)).is_none() && list.vector(id(9_000)).is_some());
+        assert!(before.row(id(5)).is_some() && before.row(id(9_000)).is_none());
+        assert!(list.row(id(5)).is_none() && list.row(id(9_000)).is_some());
         // The group that did not change is still shared.
         assert!(Arc::ptr_eq(&before.groups[1], &list.groups[1]));
         assert!(!Arc::ptr_eq(&before.groups[0], &list.groups[0]));

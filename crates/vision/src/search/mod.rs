@@ -23,6 +23,7 @@
 //! | `build` | [`IndexBuilder`]: an index from references that arrive one after another |
 //! | `list`, `sealed`, `block` | the blocks, their list, and which rows of them are removed |
 //! | `scan`, `nearest` | one query against blocks: bounds first, then exact distances |
+//! | `near` | the references around some points, by position alone |
 //! | `filter` | the geographic and time filter, prepared for a query |
 //! | `entry`, `quantised` | a reference as it is given, and its vector as int8 codes |
 
@@ -32,6 +33,7 @@ mod entry;
 mod filter;
 mod index;
 mod list;
+mod near;
 mod nearest;
 mod quantised;
 mod scan;
@@ -40,5 +42,5 @@ mod sealed;
 mod tests;
 
 pub use build::IndexBuilder;
-pub use entry::{IndexEntry, Neighbour};
+pub use entry::{IndexEntry, LocatedReference, Neighbour};
 pub use index::MapIndex;

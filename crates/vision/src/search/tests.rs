@@ -2,9 +2,9 @@
 
 use super::block::CAPACITY;
 use super::nearest::squared_distance;
-use super::{IndexEntry, MapIndex, Neighbour};
+use super::{IndexEntry, LocatedReference, MapIndex, Neighbour};
 use placeformer_core::types::{
-    GLOBAL_DIM, GeoCircle, GeoPoint, ReferenceFilter, ReferenceId, Timestamp,
+    GLOBAL_DIM, GeoCircle, GeoPoint, Heading, ReferenceFilter, ReferenceId, Timestamp,
 };
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
@@ -80,6 +80,8 @@ fn entry(number: u64, kind: Kind, seed: u64) -> IndexEntry {
         id: id(number),
         global: vector(kind, seed),
         location,
+        alt: None,
+        heading: None,
         captured_at,
     }
 }
@@ -328,4 +330,58 @@ fn searches_during_changes_see_each_reference_whole() {
             );
         }
     });
+}
+
+proptest! {
+    #[test]
+    fn the_references_around_points_are_those_in_some_circle(
+        places in prop::collection::vec(
+            prop::option::weighted(0.9, (-0.02..0.02f64, -0.02..0.02f64)), 0..300),
+        centres in prop::collection::vec((-0.02..0.02f64, -0.02..0.02f64), 0..20),
+        radius in 1.0..2000.0f64,
+        (lat, lon) in prop_oneof![Just((51.0, 7.0)), Just((0.0, 180.0)), Just((89.99, 0.0))],
+        removed in 0usize..300,
+    ) {
+        let point = |(north, east): (f64, f64)| {
+            let lon = (lon + east + 180.0).rem_euclid(360.0) - 180.0;
+            GeoPoint::new((lat + north).min(90.0), lon).unwrap()
+        };
+        let entries: Vec<IndexEntry> = places.iter().enumerate().map(|(i, place)| IndexEntry {
+            location: place.map(point),
+            heading: Heading::new(i as f64).ok(),
+            ..entry(i as u64, Kind::Zero, 0)
+        }).collect();
+        let index = MapIndex::build(entries.clone());
+        index.remove(id(removed as u64));
+        let circles: Vec<GeoCircle> = centres
+            .into_iter()
+            .map(|centre| GeoCircle::new(point(centre), radius).unwrap())
+            .collect();
+        let there = entries.iter().filter(|entry| entry.id != id(removed as u64));
+        let expected: Vec<ReferenceId> = there
+            .filter(|entry| {
+                entry.location.is_some_and(|at| circles.iter().any(|circle| circle.contains(at)))
+            })
+            .map(|entry| entry.id)
+            .collect();
+        let found = index.near(&circles, &ReferenceFilter::default(), usize::MAX);
+        let ids: Vec<ReferenceId> = found.iter().map(|located| located.id).collect();
+        prop_assert_eq!(&ids, &expected);
+        let located: Vec<LocatedReference> = index.located(&ids).into_iter().flatten().collect();
+        prop_assert_eq!(&located, &found);
+        let few = index.near(&circles, &ReferenceFilter::default(), 10);
+        prop_assert_eq!(few.len(), found.len().min(10));
+    }
+}
+
+#[test]
+fn references_are_compared_by_name_as_a_search_does() {
+    let entries: Vec<IndexEntry> = (0..200).map(|i| entry(i, Kind::Axis, i)).collect();
+    let index = MapIndex::build(entries);
+    let query = vector(Kind::Axis, 7);
+    let all = index.search(&query, 200, &ReferenceFilter::default());
+    let ids: Vec<ReferenceId> = all.iter().map(|neighbour| neighbour.id).collect();
+    assert_eq!(index.compare(&query, &ids), all);
+    assert_eq!(index.compare(&query, &[id(1_000)]), []);
+    assert_eq!(index.located(&[id(0), id(1_000)]), [None, None]);
 }

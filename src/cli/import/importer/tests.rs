@@ -46,6 +46,7 @@ impl Sink for Memory {
             id: ReferenceId::generate(),
             content: ContentHash::of(&upload.image),
             location: fields.location,
+            alt: fields.alt,
             heading: fields.heading,
             captured_at: fields.captured_at,
         };
@@ -59,6 +60,9 @@ impl Sink for Memory {
         let stored = map.values_mut().find(|stored| stored.id == id).unwrap();
         if let Some(location) = patch.location {
             stored.location = location;
+        }
+        if let Some(alt) = patch.alt {
+            stored.alt = alt;
         }
         if let Some(heading) = patch.heading {
             stored.heading = heading;

@@ -11,7 +11,7 @@ use anyhow::{Context, ensure};
 use matching::PhotoNames;
 pub(super) use matching::folder_of;
 use placeformer_core::printable::Printable;
-use placeformer_core::types::{GeoPoint, Heading, Timestamp};
+use placeformer_core::types::{Altitude, GeoPoint, Heading, Timestamp};
 use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
 
@@ -19,6 +19,7 @@ use std::path::Path;
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Row {
     pub(super) location: Option<GeoPoint>,
+    pub(super) alt: Option<Altitude>,
     pub(super) heading: Option<Heading>,
     pub(super) captured_at: Option<Timestamp>,
 }

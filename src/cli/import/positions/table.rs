@@ -12,7 +12,7 @@ use anyhow::{Context, anyhow, bail, ensure};
 use csv::{ReaderBuilder, StringRecord, Trim};
 use placeformer_core::clock::Clock;
 use placeformer_core::printable::Printable;
-use placeformer_core::types::{GeoPoint, Heading, Timestamp};
+use placeformer_core::types::{Altitude, GeoPoint, Heading, Timestamp};
 
 /// A meaning with the headings for it, in lower case without spaces, dashes and underscores. Of two
 /// columns with the same meaning, the one whose heading stands first here counts.
@@ -39,6 +39,10 @@ const LAT: Synonyms = ("lat", &["lat", "latitude", "gpslatitude", "y"]);
 const LON: Synonyms = (
     "lon",
     &["lon", "lng", "long", "longitude", "gpslongitude", "x"],
+);
+const ALT: Synonyms = (
+    "alt",
+    &["alt", "altitude", "gpsaltitude", "elevation", "height", "z"],
 );
 const HEADING: Synonyms = (
     "heading",
@@ -151,6 +155,7 @@ struct Columns {
     file: Option<usize>,
     lat: Option<usize>,
     lon: Option<usize>,
+    alt: Option<usize>,
     heading: Option<usize>,
     captured_at: Option<usize>,
 }
@@ -170,16 +175,18 @@ impl Columns {
             file: column(FILE),
             lat: column(LAT),
             lon: column(LON),
+            alt: column(ALT),
             heading: column(HEADING),
             captured_at: column(CAPTURED_AT),
         }
     }
 
-    fn all(&self) -> [(&'static str, Option<usize>); 5] {
+    fn all(&self) -> [(&'static str, Option<usize>); 6] {
         [
             (FILE.0, self.file),
             (LAT.0, self.lat),
             (LON.0, self.lon),
+            (ALT.0, self.alt),
             (HEADING.0, self.heading),
             (CAPTURED_AT.0, self.captured_at),
         ]
@@ -202,7 +209,7 @@ impl Columns {
         );
         ensure!(
             self.known() > 1,
-            "there is no column for a position, heading or time among: {shown}"
+            "there is no column for a position, height, heading or time among: {shown}"
         );
         Ok(())
     }
@@ -245,10 +252,12 @@ fn read_row(
         (None, None) => None,
         _ => bail!("lat and lon must be given both or not at all"),
     };
+    let alt = number("alt", columns.alt)?;
     let heading = number("heading", columns.heading)?;
     let captured_at = field(columns.captured_at).map(|text| parse_time(text, zone));
     let row = Row {
         location,
+        alt: alt.map(Altitude::new).transpose()?,
         heading: heading.map(Heading::new).transpose()?,
         captured_at: captured_at.transpose()?,
     };

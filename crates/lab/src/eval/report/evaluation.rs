@@ -6,6 +6,7 @@ use crate::datasets::Dataset;
 use crate::eval::answers::DatasetAnswers;
 use crate::eval::calibrate::Applied;
 use crate::eval::measure::{Interval, RECALL_AT, Rejection};
+use crate::eval::sequences::Certainty;
 use crate::eval::summary::{AtK, GroupSummary, Summary};
 use maud::{Markup, html};
 
@@ -22,6 +23,7 @@ pub fn html(
         (lead(summary))
         (recall_table(summary))
         (calibration_table(summary))
+        (sequences_table(summary))
         (poses_table(summary))
         (groups_table(summary))
         (costs_tables(summary))
@@ -170,6 +172,44 @@ fn calibration_table(summary: &Summary) -> Markup {
         "recall of those, %",
     ];
     table("How far confidences can be believed", &headers, &rows)
+}
+
+/// What tracks gain over single answers.
+fn sequences_table(summary: &Summary) -> Markup {
+    let Some(sequences) = &summary.sequences else {
+        return html! {};
+    };
+    let recall = |recall: Option<&AtK<Option<f64>>>| {
+        percent(recall.and_then(|recall| recall.get(&1).copied().flatten()))
+    };
+    let alone = summary.recall.reranked.as_ref();
+    let alone = alone.unwrap_or(&summary.recall.global);
+    let row = |name: &str, recall: String, certainty: &Certainty| {
+        vec![
+            name.to_owned(),
+            recall,
+            format!("{:.3}", certainty.expected_calibration_error),
+            format!("{} of {}", certainty.trusted, certainty.judged),
+            certainty.trusted_and_wrong.to_string(),
+        ]
+    };
+    let rows = [
+        row("alone", recall(Some(alone)), &sequences.alone),
+        row(
+            "tracked",
+            recall(summary.recall.tracked.as_ref()),
+            &sequences.tracked,
+        ),
+    ];
+    let headers = [
+        "frames",
+        "R@1",
+        "calibration error",
+        "trusted",
+        "of these wrong",
+    ];
+    let caption = "Queries in the order of their names: each frame alone, and as one of a track";
+    table(caption, &headers, &rows)
 }
 
 fn poses_table(summary: &Summary) -> Markup {

@@ -6,6 +6,7 @@ use crate::datasets::{Dataset, Truth};
 use crate::eval::answers::DatasetAnswers;
 use crate::eval::measure::{Rejection, ReliabilityBin, first_hit, recall_at};
 use crate::eval::run::Answer;
+use crate::eval::sequences::{Certainty, SequenceSummary};
 use crate::eval::summary::Summary;
 use maud::{Markup, html};
 
@@ -37,6 +38,20 @@ pub fn plots(summary: &Summary, dataset: &Dataset, answers: &DatasetAnswers) -> 
             "Share of right answers by confidence, with the calibration error; the dashed line is \
              ideal. What is fitted here is five-fold cross-validated.",
         ));
+    }
+    if let Some(sequences) = &summary.sequences {
+        figures.push((
+            certainty_plot(sequences),
+            "Share of right answers by confidence, each frame alone and as one of a track; the \
+             dashed line is ideal.",
+        ));
+        if !sequences.accuracy.is_empty() {
+            figures.push((
+                accuracy_plot(sequences),
+                "Share of trusted positions whose error is within the radius that their accuracy \
+                 gives for an expected share; the dashed line is ideal.",
+            ));
+        }
     }
     html! {
         div.plots {
@@ -168,6 +183,67 @@ fn score_plot(dataset: &Dataset, answers: &DatasetAnswers) -> Markup {
     .render()
 }
 
+/// A line that would be reached if everything were as it says.
+fn ideal() -> Series {
+    Series {
+        name: String::new(),
+        class: "muted",
+        points: vec![(0.0, 0.0), (1.0, 1.0)],
+        dots: false,
+    }
+}
+
+fn certainty_plot(sequences: &SequenceSummary) -> Markup {
+    let line = |name: &str, class, certainty: &Certainty| Series {
+        name: format!("{name}, error {:.3}", certainty.expected_calibration_error),
+        class,
+        points: certainty
+            .bins
+            .iter()
+            .map(|bin| (bin.confidence, bin.accuracy))
+            .collect(),
+        dots: true,
+    };
+    LineChart {
+        title: "Reliability of tracks".into(),
+        x_label: "confidence".into(),
+        y_label: "share of right answers".into(),
+        x_range: (0.0, 1.0),
+        y_range: (0.0, 1.0),
+        series: vec![
+            ideal(),
+            line("tracked", "a", &sequences.tracked),
+            line("alone", "b", &sequences.alone),
+        ],
+    }
+    .render()
+}
+
+fn accuracy_plot(sequences: &SequenceSummary) -> Markup {
+    let points = sequences
+        .accuracy
+        .iter()
+        .map(|point| (point.expected, point.observed))
+        .collect();
+    LineChart {
+        title: "Accuracy of positions".into(),
+        x_label: "expected share within the radius".into(),
+        y_label: "share within it".into(),
+        x_range: (0.0, 1.0),
+        y_range: (0.0, 1.0),
+        series: vec![
+            ideal(),
+            Series {
+                name: "trusted positions".into(),
+                class: "a",
+                points,
+                dots: true,
+            },
+        ],
+    }
+    .render()
+}
+
 fn reliability_plot(summary: &Summary) -> Option<Markup> {
     let line = |name: String, class, bins: &[ReliabilityBin]| {
         let points = bins
@@ -201,15 +277,7 @@ fn reliability_plot(summary: &Summary) -> Option<Markup> {
     if series.is_empty() {
         return None;
     }
-    series.insert(
-        0,
-        Series {
-            name: String::new(),
-            class: "muted",
-            points: vec![(0.0, 0.0), (1.0, 1.0)],
-            dots: false,
-        },
-    );
+    series.insert(0, ideal());
     let chart = LineChart {
         title: "Reliability of confidences".into(),
         x_label: "confidence".into(),

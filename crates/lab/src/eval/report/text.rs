@@ -1,7 +1,8 @@
 //! The result as plain text for a terminal.
 
 use crate::eval::calibrate::Applied;
-use crate::eval::measure::RECALL_AT;
+use crate::eval::measure::{Interval, RECALL_AT};
+use crate::eval::sequences::Finding;
 use crate::eval::summary::{AtK, Summary};
 use std::fmt::{self, Write};
 
@@ -36,6 +37,7 @@ fn write_all(out: &mut String, summary: &Summary) -> fmt::Result {
     rejection(out, summary)?;
     poses(out, summary)?;
     calibration(out, summary)?;
+    sequences(out, summary)?;
     costs(out, summary)?;
     problems(out, summary)
 }
@@ -137,20 +139,72 @@ fn recall_table(out: &mut String, summary: &Summary) -> fmt::Result {
         let (Some(interval), Some(map)) = (interval, map) else {
             continue;
         };
-        let cells: Vec<String> = RECALL_AT
-            .iter()
-            .map(|k| match (cell(recall, *k), interval.get(k)) {
-                (Some(value), Some(i)) => format!(
-                    "{:>22}",
-                    format!("{value:.1} [{:.1}, {:.1}]", i.low, i.high)
-                ),
-                _ => format!("{:>22}", "-"),
-            })
-            .collect();
         let map = map.values().last().copied().unwrap_or(0.0);
-        writeln!(out, "{name:<10}{}   mAP@20 {map:.3}", cells.concat())?;
+        let cells = recall_cells(recall, interval);
+        writeln!(out, "{name:<10}{cells}   mAP@20 {map:.3}")?;
+    }
+    let tracked = summary.recall.tracked.as_ref();
+    if let Some((recall, interval)) = tracked.zip(summary.recall_interval.tracked.as_ref()) {
+        writeln!(out, "{:<10}{}", "tracked", recall_cells(recall, interval))?;
     }
     Ok(())
+}
+
+fn recall_cells(recall: &AtK<Option<f64>>, intervals: &AtK<Interval>) -> String {
+    let cell = |k: &usize| match (cell(recall, *k), intervals.get(k)) {
+        (Some(value), Some(i)) => format!(
+            "{:>22}",
+            format!("{value:.1} [{:.1}, {:.1}]", i.low, i.high)
+        ),
+        _ => format!("{:>22}", "-"),
+    };
+    RECALL_AT.iter().map(cell).collect()
+}
+
+/// What tracks gain, and how far they can be believed.
+fn sequences(out: &mut String, summary: &Summary) -> fmt::Result {
+    let Some(sequences) = &summary.sequences else {
+        return Ok(());
+    };
+    for (name, certainty) in [("alone", &sequences.alone), ("tracked", &sequences.tracked)] {
+        writeln!(
+            out,
+            "{name:<10} calibration error {:.3}; {} of {} frames are trusted, {} of them wrong",
+            certainty.expected_calibration_error,
+            certainty.trusted,
+            certainty.judged,
+            certainty.trusted_and_wrong
+        )?;
+    }
+    let findings = [
+        ("found after", &sequences.first_found),
+        (
+            "carried elsewhere, found again after",
+            &sequences.found_again,
+        ),
+    ];
+    for (name, Finding { frames, never }) in findings {
+        writeln!(out, "{name} {frames:?} frames, {never} times never")?;
+    }
+    writeln!(out, "lost after {} frames", sequences.frames_lost)?;
+    if let (Some(error), Some(of_best)) =
+        (sequences.median_error_m, sequences.median_error_of_best_m)
+    {
+        writeln!(
+            out,
+            "median error of trusted positions {error:.1} m, of their best reference {of_best:.1} m"
+        )?;
+        let shares = sequences.accuracy.iter();
+        let shares: Vec<String> = shares
+            .map(|at| format!("{:.0}%: {:.0}%", 100.0 * at.expected, 100.0 * at.observed))
+            .collect();
+        writeln!(
+            out,
+            "errors within the accuracy, expected: observed  {}",
+            shares.join("  ")
+        )?;
+    }
+    writeln!(out, "the filter takes {:.2} ms a frame", sequences.step_ms)
 }
 
 fn cell(recall: &AtK<Option<f64>>, k: usize) -> Option<f64> {

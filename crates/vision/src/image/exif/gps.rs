@@ -7,13 +7,15 @@
 
 use super::tiff::{Directory, Field};
 use placeformer_core::clock::{in_range, parse_date};
-use placeformer_core::types::{GeoPoint, Heading, Timestamp};
+use placeformer_core::types::{Altitude, GeoPoint, Heading, Timestamp};
 use time::{Duration, PrimitiveDateTime, Time};
 
 const LATITUDE_REF: u16 = 1;
 const LATITUDE: u16 = 2;
 const LONGITUDE_REF: u16 = 3;
 const LONGITUDE: u16 = 4;
+const ALTITUDE_REF: u16 = 5;
+const ALTITUDE: u16 = 6;
 const TIME_STAMP: u16 = 7;
 const SATELLITES: u16 = 8;
 const STATUS: u16 = 9;
@@ -23,11 +25,13 @@ const IMAGE_DIRECTION: u16 = 17;
 const DATE_STAMP: u16 = 29;
 
 /// The tags that are used.
-pub(super) const TAGS: [u16; 11] = [
+pub(super) const TAGS: [u16; 13] = [
     LATITUDE_REF,
     LATITUDE,
     LONGITUDE_REF,
     LONGITUDE,
+    ALTITUDE_REF,
+    ALTITUDE,
     TIME_STAMP,
     SATELLITES,
     STATUS,
@@ -43,6 +47,7 @@ pub(super) struct Gps {
     /// The receiver says that it had no fix, so that its position and time are not to be used.
     pub(super) is_void: bool,
     pub(super) location: Option<GeoPoint>,
+    pub(super) alt: Option<Altitude>,
     pub(super) heading: Option<Heading>,
     /// In UTC.
     pub(super) time: Option<Timestamp>,
@@ -64,6 +69,7 @@ impl Gps {
         Self {
             is_void: false,
             location: location(gps),
+            alt: altitude(gps),
             heading,
             time: gps_time(gps),
         }
@@ -75,6 +81,7 @@ impl Gps {
         Self {
             is_void: location.is_none() && (self.is_void || other.is_void),
             location,
+            alt: self.alt.or(other.alt),
             heading: self.heading.or(other.heading),
             time: self.time.or(other.time),
         }
@@ -161,6 +168,15 @@ fn degrees(field: Field<'_>) -> Option<f64> {
     let magnitude = parts[0].abs() + parts[1].abs() / 60.0 + parts[2].abs() / 3600.0;
     let is_negative = parts.iter().any(|part| *part < 0.0);
     Some(if is_negative { -magnitude } else { magnitude })
+}
+
+/// The height in metres, as it stands: of the four references, 1 and 3 are below sea level and
+/// below the ellipsoid. Where there is none, the number's own sign counts.
+fn altitude(gps: &Directory<'_>) -> Option<Altitude> {
+    let metres = gps.field(ALTITUDE)?.number(0)?;
+    let reference = gps.field(ALTITUDE_REF).and_then(|field| field.number(0));
+    let is_below = reference == Some(1.0) || reference == Some(3.0);
+    Altitude::new(if is_below { -metres.abs() } else { metres }).ok()
 }
 
 fn gps_time(gps: &Directory<'_>) -> Option<Timestamp> {

@@ -28,7 +28,7 @@ use block::Blocks;
 use gps::Gps;
 use moment::Moment;
 use placeformer_core::clock::{Clock, parse_fraction, parse_utc_offset};
-use placeformer_core::types::{GeoPoint, Heading, Timestamp};
+use placeformer_core::types::{Altitude, GeoPoint, Heading, Timestamp};
 use tiff::{Directory, Tiff};
 use time::PrimitiveDateTime;
 use xmp::Xmp;
@@ -40,6 +40,8 @@ pub struct ExifInfo {
     /// Position. There is none if the receiver marked it as invalid, if the hemisphere is unknown,
     /// or if it is (0, 0) and nothing else says that there was a fix.
     pub location: Option<GeoPoint>,
+    /// Height in metres, by EXIF. There is none without a position.
+    pub alt: Option<Altitude>,
     /// Direction in which the camera looked, in degrees. A bearing from magnetic north is not
     /// corrected.
     pub heading: Option<Heading>,
@@ -58,6 +60,8 @@ pub struct ExifInfo {
 pub struct ExifSources {
     /// That of the position.
     pub location: Option<MetadataBlock>,
+    /// That of the height.
+    pub alt: Option<MetadataBlock>,
     /// That of the heading.
     pub heading: Option<MetadataBlock>,
     /// That of the time.
@@ -83,13 +87,17 @@ pub fn read_exif(bytes: &[u8]) -> ExifInfo {
     let xmp_location = xmp.location.filter(|_| !exif.gps.is_void);
     let (location, location_source) = first(exif.gps.location, xmp_location);
     let (heading, heading_source) = first(exif.gps.heading, xmp.heading);
+    // A receiver that had no fix noted no height either.
+    let (alt, alt_source) = first(exif.gps.alt.filter(|_| location.is_some()), None);
     ExifInfo {
         location,
+        alt,
         heading,
         captured_at: captured_at.map(|moment| moment.at),
         local_time: captured_at.and_then(|moment| moment.local),
         sources: ExifSources {
             location: location_source,
+            alt: alt_source,
             heading: heading_source,
             captured_at: time_source,
         },

@@ -164,3 +164,29 @@ fn headings_of_every_type_are_read() {
         assert_eq!(heading(value.clone()), expected, "{value:?}");
     }
 }
+
+#[test]
+fn heights_are_read_with_their_references() {
+    let here = || at(("N", thirds([48, 51, 30])), ("E", thirds([2, 17, 40])));
+    let metres = |exif: Exif| exif.read().alt.map(|alt| alt.metres());
+    let height = |text: (i32, i32)| Value::SignedRational(vec![text]);
+    for (reference, value, expected) in [
+        (None, (1155, 10), Some(115.5)),
+        (None, (-7, 2), Some(-3.5)),
+        (Some(0), (1155, 10), Some(115.5)),
+        (Some(2), (1155, 10), Some(115.5)),
+        (Some(1), (7, 2), Some(-3.5)),
+        (Some(1), (-7, 2), Some(-3.5)),
+        (Some(3), (7, 2), Some(-3.5)),
+        (Some(0), (1, 0), None),
+        (Some(0), (2_000_000, 1), None),
+    ] {
+        let mut exif = here().gps(6, height(value));
+        if let Some(reference) = reference {
+            exif = exif.gps(5, Value::Byte(vec![reference]));
+        }
+        assert_eq!(metres(exif), expected, "{reference:?} {value:?}");
+    }
+    let nowhere = Exif::default().gps(6, height((1155, 10)));
+    assert_eq!(metres(nowhere), None, "a height without a position");
+}

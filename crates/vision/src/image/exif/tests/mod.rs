@@ -29,6 +29,7 @@ fn every_container_and_both_orders_say_the_same() {
             let exif = Some(MetadataBlock::Exif);
             let expected = ExifSources {
                 location: exif,
+                alt: None,
                 heading: exif,
                 captured_at: exif,
             };
