@@ -4,7 +4,7 @@ use crate::cli::choice::choice;
 use crate::cli::data_args::ReadArgs;
 use crate::cli::output::note;
 use anyhow::{bail, ensure};
-use placeformer_core::types::ScaleSet;
+use placeformer_core::types::{ScaleSet, ScoreKind};
 use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions};
 use placeformer_lab::eval::features::{Describe, FeatureCache, GlobalKind};
 use placeformer_vision::extract::Preset;
@@ -116,6 +116,15 @@ pub(super) struct RerankArgs {
         value_name = "SET"
     )]
     pub(super) scales: Vec<ScaleSet>,
+    /// What candidates are ordered by: the number of inliers, that fused with the global distance,
+    /// or a score learned by `eval calibrate`.
+    #[arg(
+        long,
+        value_parser = parse_score,
+        default_value = "paper",
+        value_name = "paper|fused|learned"
+    )]
+    pub(super) score: ScoreKind,
 }
 
 /// Where results go.
@@ -148,6 +157,12 @@ pub(super) struct CacheArgs {
     /// Megabytes of key patches held in memory.
     #[arg(long, default_value_t = 1024, value_name = "MB")]
     patch_memory: u64,
+}
+
+fn parse_score(text: &str) -> Result<ScoreKind, String> {
+    let mut kinds = ScoreKind::ALL.into_iter();
+    let known = kinds.find(|kind| kind.as_str() == text);
+    known.ok_or_else(|| "use paper, fused or learned".to_owned())
 }
 
 impl DataArgs {
@@ -207,6 +222,7 @@ impl RerankArgs {
     pub(super) fn config(&self) -> RerankConfig {
         RerankConfig {
             scales: self.scales.clone(),
+            score: self.score,
             ..Default::default()
         }
     }

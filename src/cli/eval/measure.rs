@@ -7,7 +7,7 @@ use crate::cli::output::{note, say_part};
 use crate::cli::progress::ProgressBars;
 use anyhow::{Context, bail};
 use maud::html;
-use placeformer_core::types::Calibration;
+use placeformer_core::types::{Calibration, ScoreKind};
 use placeformer_lab::datasets::{Dataset, DatasetKind};
 use placeformer_lab::eval::ablate::{Ablation, Base, ablate};
 use placeformer_lab::eval::answers::DatasetAnswers;
@@ -18,8 +18,9 @@ use placeformer_lab::eval::run::Answer;
 use placeformer_lab::eval::summarise::summarise;
 use placeformer_lab::eval::summary::{RunConfig, Summary};
 use placeformer_lab::eval::{EvalError, prediction, report};
+use placeformer_models::built_in_calibration;
 use placeformer_vision::extract::ExtractConfig;
-use placeformer_vision::rerank::Reranker;
+use placeformer_vision::rerank::{Ranking, Reranker, feature_names};
 use std::path::Path;
 
 /// Arguments of an evaluation without a further subcommand.
@@ -110,13 +111,14 @@ fn measure(
     let progress = ProgressBars::default();
     let cache = &args.output.cache;
     let described = describe(describer, cache, dataset, method.global, &progress)?;
-    let answers = described.answer(
+    let mut answers = described.answer(
         dataset,
         own.as_ref(),
         config.candidates,
         config.rerank.as_ref(),
         &progress,
     )?;
+    order(&mut answers, &config, given.as_ref())?;
     let summary = summarise(
         dataset,
         &described.database,
@@ -126,6 +128,33 @@ fn measure(
         given.as_ref(),
     );
     Ok((answers, summary))
+}
+
+/// Orders the candidates by the score of `config`. A learned one comes from the calibration given,
+/// or from the model's own.
+fn order(
+    answers: &mut DatasetAnswers,
+    config: &RunConfig,
+    given: Option<&Calibration>,
+) -> anyhow::Result<()> {
+    let Some(rerank) = &config.rerank else {
+        return Ok(());
+    };
+    match rerank.score {
+        ScoreKind::Paper => {}
+        ScoreKind::Fused => answers.order_by(&Ranking::Fused),
+        ScoreKind::Learned => {
+            let shipped = built_in_calibration(&config.model);
+            let calibrations = given.into_iter().chain(shipped.as_ref());
+            let mut learned = calibrations.filter_map(Calibration::learned_score);
+            let score = learned.next().context(
+                "the model has no learned score: give one of eval calibrate by --calibration",
+            )?;
+            score.check_features(&feature_names(&rerank.scales))?;
+            answers.order_by(&Ranking::Learned(score));
+        }
+    }
+    Ok(())
 }
 
 fn read_calibration(path: &Path) -> anyhow::Result<Calibration> {
@@ -176,6 +205,7 @@ fn run_ablation(
         backbones: &backbones,
         cache: &args.output.cache.folder()?,
         memory_bytes: args.output.cache.memory_bytes(),
+        radius_m: args.data.radius,
     };
     let open = |config: &ExtractConfig| -> Result<Box<dyn Describe>, EvalError> {
         match open_describer(config) {

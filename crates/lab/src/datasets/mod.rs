@@ -9,6 +9,7 @@
 //! | `dataset`, `pose` | what every reader answers with |
 //! | `kind`, `options` | which data set to read, and how |
 //! | `msls`, `nordland`, `pairs`, `robotcar`, `utm` | the readers |
+//! | `quarter` | a part of the ground that is held out |
 //! | `layout`, `table`, `positions`, `zones`, `neighbours` | what several readers need |
 
 mod dataset;
@@ -22,6 +23,7 @@ mod options;
 mod pairs;
 mod pose;
 mod positions;
+mod quarter;
 mod robotcar;
 mod table;
 mod utm;
@@ -34,6 +36,7 @@ pub use neighbours::NeighbourGrid;
 pub use options::DatasetOptions;
 pub use pairs::load_pairs;
 pub use pose::Pose;
+pub use quarter::{Parted, Quarter};
 
 use std::path::Path;
 

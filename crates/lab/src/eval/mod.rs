@@ -8,6 +8,7 @@
 //! | [`own_places`] | what is left out of the database to make a query one without a match |
 //! | [`measure`] | the numbers, as pure functions |
 //! | [`summary`], [`mod@summarise`] | all numbers of a run as one value, and how it is made |
+//! | [`learn`], [`score_table`] | scores of candidates that are learned, and what they are worth |
 //! | [`calibrate`] | from answers to how far they can be trusted |
 //! | [`mod@ablate`] | the same along the axes of the paper's tables |
 //! | [`report`], [`evidence`] | text, pages, pictures |
@@ -19,12 +20,14 @@ pub mod calibrate;
 mod error;
 pub mod evidence;
 pub mod features;
+pub mod learn;
 pub mod measure;
 pub mod own_places;
 mod places;
 pub mod prediction;
 pub mod report;
 pub mod run;
+pub mod score_table;
 pub mod summarise;
 pub mod summary;
 
