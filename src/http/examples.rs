@@ -46,6 +46,7 @@ pub(super) fn info() -> Value {
         "model": MODEL,
         "input_size": {"width": 448, "height": 336},
         "scales": ["1", "1+2", "2+3"],
+        "score": "learned",
         "calibration": calibration(),
         "limits": {
             "max_image_bytes": 20_971_520,
@@ -95,13 +96,19 @@ pub(super) fn calibration() -> Value {
         })
     };
     json!({
-        "format": 1,
+        "format": 2,
         "model": MODEL,
-        "rerank": "1,1+2,2+3:t1.5:i2000:c0.995",
+        "rerank": "1,1+2,2+3:t1.5:i2000:c0.995:learned",
         "data": "harbour, two drives",
         "target_precision": 0.99,
         "reranked": curve(-1.82, 3.86, -14.45, 0.892),
         "global": curve(17.93, 0.0, -17.45, 0.924),
+        "learned_score": {
+            "bias": -3.1,
+            "terms": [
+                {"feature": "s11.inliers", "mean": 2.2, "deviation": 0.7, "weight": 0.9},
+            ],
+        },
     })
 }
 
@@ -176,6 +183,7 @@ pub(super) fn query_answer() -> Value {
             "external_id": "drive7/000123.jpg",
             "location": location(),
             "global_distance": 0.41,
+            "score": 4.2,
             "spatial_score": 412,
             "scores": {
                 "s11": {"matches": 171, "inliers": 122},
@@ -186,6 +194,7 @@ pub(super) fn query_answer() -> Value {
             "metadata": {"camera": "left"},
         }],
         "reranked": true,
+        "ranked_by": "learned",
         "matched": true,
         "confidence": 0.996,
         "unmatched_reason": null,

@@ -1,9 +1,13 @@
 //! Whether a best answer can be trusted: judged by the calibration of its map, else by that of the
-//! model. Where there is neither, the answer says nothing about it.
+//! model. Where there is neither, the answer says nothing about it. A calibration also brings the
+//! score that candidates are ranked by, where that is a learned one.
 
 use super::PipelineError;
-use placeformer_core::types::{Calibration, ConfidenceCurve, MapName, ModelId, RerankId};
+use placeformer_core::types::{
+    Calibration, ConfidenceCurve, LearnedScore, MapName, ModelId, RerankId, ScoreKind,
+};
 use placeformer_models::built_in_calibrations;
+use placeformer_vision::rerank::{Ranking, RerankConfig, feature_names};
 
 /// How far the best answer can be trusted.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -41,8 +45,9 @@ impl MatchConfidence {
 /// What the best answer of a query is judged by.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BestAnswer {
-    /// Its score S; absent if it was not re-ranked.
-    pub(super) spatial_score: Option<u32>,
+    /// What the ranking's value counts for ([`ScoreKind::evidence`]); absent if it was not
+    /// re-ranked.
+    pub(super) evidence: Option<f64>,
     /// Euclidean distance between its global descriptor and the query's.
     pub(super) global_distance: f32,
 }
@@ -51,14 +56,35 @@ pub(super) struct BestAnswer {
 pub(super) struct Calibrations {
     built_in: Vec<Calibration>,
     rerank: RerankId,
+    /// The features that a learned score must have been fitted on.
+    features: Vec<String>,
 }
 
 impl Calibrations {
     /// For a server that re-ranks as `rerank` says.
-    pub(super) fn new(rerank: RerankId) -> Self {
+    pub(super) fn new(rerank: &RerankConfig) -> Self {
         Self {
             built_in: built_in_calibrations().collect(),
-            rerank,
+            rerank: rerank.id(),
+            features: feature_names(&rerank.scales),
+        }
+    }
+
+    /// What the candidates of a map of `model`, with a calibration of its `own` or none, are
+    /// ranked by. By S where no calibration in force has a learned score; the answer says so.
+    pub(super) fn ranking<'a>(
+        &'a self,
+        model: &ModelId,
+        own: Option<&'a Calibration>,
+    ) -> Ranking<'a> {
+        match self.rerank.score() {
+            ScoreKind::Paper => Ranking::Paper,
+            ScoreKind::Fused => Ranking::Fused,
+            ScoreKind::Learned => {
+                let in_force = self.in_force(model, own);
+                let score = in_force.and_then(Calibration::learned_score);
+                score.map_or(Ranking::Paper, Ranking::Learned)
+            }
         }
     }
 
@@ -80,12 +106,11 @@ impl Calibrations {
         let Some(best) = best else {
             return MatchConfidence::unmatched(UnmatchedReason::NoResults);
         };
-        let Some(curve) = self.curve(model, own, best.spatial_score.is_some()) else {
+        let Some(curve) = self.curve(model, own, best.evidence.is_some()) else {
             return MatchConfidence::default();
         };
-        let spatial_score = best.spatial_score.map(f64::from);
         let global_distance = f64::from(best.global_distance);
-        let confidence = curve.weights.confidence(spatial_score, global_distance);
+        let confidence = curve.weights.confidence(best.evidence, global_distance);
         let matched = curve.trusts(confidence);
         MatchConfidence {
             matched: Some(matched),
@@ -123,27 +148,57 @@ impl Calibrations {
         own: Option<&'a Calibration>,
         reranked: bool,
     ) -> Option<&'a ConfidenceCurve> {
-        let by_precedence = own.into_iter().chain(self.built_in(model));
-        let mut usable =
-            by_precedence.filter(|calibration| !reranked || *calibration.rerank() == self.rerank);
-        let calibration = usable.next()?;
-        Some(calibration.curve(reranked))
+        let calibration = match reranked {
+            true => self.in_force(model, own),
+            false => own.or(self.built_in(model)),
+        };
+        Some(calibration?.curve(reranked))
     }
 
-    /// Refuses a calibration that was fitted on scores of another re-ranking than this server's.
+    /// The first calibration that holds for this server's re-ranking: the map's own, or the
+    /// model's.
+    fn in_force<'a>(
+        &'a self,
+        model: &ModelId,
+        own: Option<&'a Calibration>,
+    ) -> Option<&'a Calibration> {
+        let mut by_precedence = own.into_iter().chain(self.built_in(model));
+        by_precedence.find(|calibration| {
+            let holds_for_features =
+                |score: &LearnedScore| score.check_features(&self.features).is_ok();
+            *calibration.rerank() == self.rerank
+                && calibration.learned_score().is_none_or(holds_for_features)
+        })
+    }
+
+    /// Refuses a calibration that was fitted on scores of another re-ranking than this server's,
+    /// or whose learned score was fitted on other features.
     pub(super) fn check(
         &self,
         map: &MapName,
         calibration: &Calibration,
     ) -> Result<(), PipelineError> {
-        if *calibration.rerank() == self.rerank {
-            return Ok(());
+        if *calibration.rerank() != self.rerank {
+            return Err(PipelineError::RerankMismatch {
+                map: map.clone(),
+                server: self.rerank.clone(),
+                given: calibration.rerank().clone(),
+            });
         }
-        Err(PipelineError::RerankMismatch {
-            map: map.clone(),
-            server: self.rerank.clone(),
-            given: calibration.rerank().clone(),
-        })
+        if let Some(score) = calibration.learned_score() {
+            score.check_features(&self.features)?;
+        }
+        Ok(())
+    }
+
+    /// Logs a warning if candidates should be ranked by a learned score, but the model has none.
+    pub(super) fn warn_if_nothing_learned(&self, model: &ModelId) {
+        let is_by_inliers = matches!(self.ranking(model, None), Ranking::Paper);
+        if self.rerank.score() == ScoreKind::Learned && is_by_inliers {
+            tracing::warn!(
+                "the model has no learned score: maps without one of their own are ranked by S"
+            );
+        }
     }
 
     /// Logs a warning if a map's calibration cannot be used for re-ranked answers here.
@@ -160,7 +215,7 @@ impl Calibrations {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use placeformer_core::types::ConfidenceWeights;
+    use placeformer_core::types::{ConfidenceWeights, ScoreTerm};
     use placeformer_models::built_in_calibration;
     use placeformer_vision::extract::Head;
     use placeformer_vision::rerank::RerankConfig;
@@ -196,10 +251,58 @@ mod tests {
     }
 
     fn answer(spatial_score: Option<u32>, global_distance: f32) -> Option<BestAnswer> {
+        let evidence = |s: u32| ScoreKind::Paper.evidence(f64::from(s));
         Some(BestAnswer {
-            spatial_score,
+            evidence: spatial_score.map(evidence),
             global_distance,
         })
+    }
+
+    /// Of a server that re-ranks as `rerank` says.
+    fn calibrations(built_in: Vec<Calibration>, rerank: &str) -> Calibrations {
+        Calibrations {
+            built_in,
+            rerank: RerankId::new(rerank),
+            features: vec!["a".into()],
+        }
+    }
+
+    fn learned(feature: &str, weight: f64) -> LearnedScore {
+        let term = ScoreTerm {
+            feature: feature.into(),
+            mean: 0.0,
+            deviation: 1.0,
+            weight,
+        };
+        LearnedScore::new(0.0, vec![term]).unwrap()
+    }
+
+    #[test]
+    fn a_learned_score_comes_from_the_map_before_the_model_and_only_where_it_holds() {
+        let with = |score: LearnedScore| {
+            let calibration = calibration("r:learned", -1.0);
+            calibration.with_score(score).unwrap()
+        };
+        let model = &ModelId::new("m");
+        let server = calibrations(vec![with(learned("a", 1.0))], "r:learned");
+        let weight = |own: Option<&Calibration>| match server.ranking(model, own) {
+            Ranking::Learned(score) => Some(score.terms()[0].weight),
+            _ => None,
+        };
+        assert_eq!(weight(None), Some(1.0));
+        assert_eq!(weight(Some(&with(learned("a", 2.0)))), Some(2.0));
+        let other_features = with(learned("b", 3.0));
+        assert_eq!(weight(Some(&other_features)), Some(1.0));
+        let map = &"m".parse().unwrap();
+        let refused = server.check(map, &other_features).unwrap_err();
+        assert!(refused.to_string().contains("learned_score"), "{refused}");
+        assert!(server.check(map, &calibration("r", 0.0)).is_err());
+
+        let without = calibrations(Vec::new(), "r:learned");
+        assert!(matches!(without.ranking(model, None), Ranking::Paper));
+        // A curve for learned scores says nothing about S.
+        let unknown = without.assess(model, None, answer(Some(100), 0.1));
+        assert_eq!(unknown, MatchConfidence::default());
     }
 
     #[test]
@@ -224,10 +327,7 @@ mod tests {
 
     #[test]
     fn the_maps_own_calibration_comes_first_and_only_where_it_holds() {
-        let calibrations = Calibrations {
-            built_in: vec![calibration("r", -3.0)],
-            rerank: RerankId::new("r"),
-        };
+        let calibrations = calibrations(vec![calibration("r", -3.0)], "r");
         let model = &ModelId::new("m");
         let assess_sure =
             |own: Option<&Calibration>| calibrations.assess(model, own, answer(Some(1000), 0.2));
@@ -265,10 +365,7 @@ mod tests {
     #[test]
     fn without_a_calibration_nothing_is_guessed_but_nothing_is_no_match() {
         let model = &ModelId::new("m");
-        let calibrations = Calibrations {
-            built_in: Vec::new(),
-            rerank: RerankId::new("r"),
-        };
+        let calibrations = calibrations(Vec::new(), "r");
         assert_eq!(
             calibrations.assess(model, None, answer(Some(1000), 0.1)),
             MatchConfidence::default()

@@ -3,8 +3,9 @@
 //! 1. The model turns the photo into a global descriptor and key patches (paper III-A to III-C).
 //! 2. Global search: the nearest global descriptors of the map are the candidates (paper III-A).
 //!    What the track of a vehicle expects is added to them.
-//! 3. Re-ranking: key patches of photo and candidates are matched, and a homography counts the
-//!    inliers (paper III-D, III-E). It is left out if the query asks so or has no time left.
+//! 3. Re-ranking: key patches of photo and candidates are matched, a homography counts the inliers
+//!    (paper III-D, III-E), and candidates are ordered by S or another score of what was found. It
+//!    is left out if the query asks so or has no time left.
 //! 4. The first results get their metadata from the store, and the best one its confidence. In a
 //!    track both the order and the confidence are those of its filter.
 
@@ -14,21 +15,19 @@ use super::blocking::blocking;
 use super::calibrations::BestAnswer;
 use super::extraction::{Described, Purpose};
 use super::maps::LiveMap;
+use super::reranking::{RankedNeighbour, RankedScore};
 use super::tracks::{Frame, Sighting, TrackAnswer, TrackOptions};
 use super::{Caller, MatchConfidence, PipelineError, Service, Timings, UnmatchedReason};
 use crate::ops::PipelineStage;
 use bytes::Bytes;
-use placeformer_core::error::ErrorCode;
 use placeformer_core::types::{
-    Deadline, Descriptor, MapName, ModelId, Reference, ReferenceFilter, ReferenceId,
+    Calibration, Deadline, MapName, ModelId, Reference, ReferenceFilter, ReferenceId, ScoreKind,
 };
 use placeformer_store::StoreError;
 use placeformer_track::Estimate;
-use placeformer_vision::rerank::{PairScore, Reranked};
 use placeformer_vision::search::Neighbour;
 use std::collections::HashMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 /// How to answer a query. Absent values take the configured default.
@@ -67,7 +66,7 @@ pub struct QueryResult {
     /// Euclidean distance between the global descriptors.
     pub global_distance: f32,
     /// Outcome of re-ranking; absent if this result was not re-ranked.
-    pub score: Option<PairScore>,
+    pub score: Option<RankedScore>,
 }
 
 /// The ranked places.
@@ -75,8 +74,8 @@ pub struct QueryResult {
 pub struct QueryAnswer {
     /// Best first.
     pub results: Vec<QueryResult>,
-    /// Whether the order comes from re-ranking.
-    pub reranked: bool,
+    /// What the re-ranked candidates are ordered by; absent if nothing was re-ranked.
+    pub ranked_by: Option<ScoreKind>,
     /// How far the first result can be trusted.
     pub confidence: MatchConfidence,
     /// Where exactly the photo was taken; `None` if the first result is not trusted or has no
@@ -90,31 +89,27 @@ pub struct QueryAnswer {
     pub model: ModelId,
 }
 
-/// A reference in the ranking, not yet looked up in the store.
-struct RankedNeighbour {
-    neighbour: Neighbour,
-    /// Outcome of re-ranking; absent if this one was not re-ranked.
-    score: Option<PairScore>,
-}
-
-impl RankedNeighbour {
-    fn by_distance(&neighbour: &Neighbour) -> Self {
-        Self {
-            neighbour,
-            score: None,
-        }
-    }
+/// What an answer can be trusted by.
+struct Trust<'a> {
+    /// The map's calibration, if it has one.
+    own: Option<&'a Calibration>,
+    /// What the re-ranked candidates are ordered by; absent if nothing was re-ranked.
+    ranked_by: Option<ScoreKind>,
+    /// Whether the photo shows nothing by which a place could be known.
+    shows_nothing: bool,
+    /// What the photo and its track together say, where they can be weighed.
+    sighting: Option<&'a Sighting>,
 }
 
 /// A query with all its defaults filled in and its map found.
-struct QueryPlan {
-    name: MapName,
-    map: Arc<LiveMap>,
+pub(super) struct QueryPlan {
+    pub(super) name: MapName,
+    pub(super) map: Arc<LiveMap>,
     top_k: usize,
-    candidates: usize,
-    rerank: bool,
+    pub(super) candidates: usize,
+    pub(super) rerank: bool,
     filter: ReferenceFilter,
-    deadline: Deadline,
+    pub(super) deadline: Deadline,
     frame: Option<Frame>,
 }
 
@@ -222,8 +217,11 @@ impl Service {
             // Some of these may have been added to the candidates.
             beyond.retain(|one| candidates.iter().all(|candidate| candidate.id != one.id));
         }
-        let reranking = self.rerank(plan, query, &candidates, &mut timings)?;
-        let reranked = reranking.is_some();
+        // Ranking and confidence are by the same calibration, even if it is replaced meanwhile.
+        let own = plan.map.calibration();
+        let by = self.calibrations.ranking(&plan.map.model, own.as_deref());
+        let reranking = self.rerank(plan, query, &candidates, by, &mut timings)?;
+        let ranked_by = reranking.as_ref().map(|_| by.kind());
         let by_distance = || {
             candidates
                 .iter()
@@ -231,16 +229,18 @@ impl Service {
                 .collect()
         };
         let mut ranking = reranking.unwrap_or_else(by_distance);
-        let sighting = self.weigh(plan, localisation, &mut ranking, reranked, &mut timings);
+        let sighting = self.weigh(plan, localisation, &mut ranking, ranked_by, &mut timings);
         ranking.extend(beyond.iter().map(RankedNeighbour::by_distance));
 
         let results = self.with_metadata(plan, ranking)?;
-        let best = results.first();
-        let confidence = match described.lacks {
-            Some(_) => MatchConfidence::unmatched(UnmatchedReason::ImageUninformative),
-            None => self.confidence(plan, best, reranked, sighting.as_ref()),
+        let trust = Trust {
+            own: own.as_deref(),
+            ranked_by,
+            shows_nothing: described.lacks.is_some(),
+            sighting: sighting.as_ref(),
         };
-        self.count_answer(best, reranked, confidence);
+        let best = results.first();
+        let confidence = self.confidence(plan, best, &trust);
         let best = best.map(|best| best.reference.id);
         let pose = || sighting.as_ref()?.pose(best?);
         Ok(QueryAnswer {
@@ -251,7 +251,7 @@ impl Service {
             },
             track: self.continue_track(plan, sighting.as_ref(), best)?,
             results,
-            reranked,
+            ranked_by,
             confidence,
             timings,
             model: plan.map.model.clone(),
@@ -271,91 +271,14 @@ impl Service {
         neighbours
     }
 
-    /// The candidates ordered by spatial score; `None` if the query does not want it or time ran
-    /// out.
-    fn rerank(
-        &self,
-        plan: &QueryPlan,
-        query: &Descriptor,
-        candidates: &[Neighbour],
-        timings: &mut Timings,
-    ) -> Result<Option<Vec<RankedNeighbour>>, PipelineError> {
-        if !plan.rerank {
-            return Ok(None);
-        }
-        let reserve = Duration::from_millis(self.config.answer_reserve_ms);
-        let time_left = plan.deadline.remaining().saturating_sub(reserve);
-        if time_left.is_zero() {
-            return Ok(None);
-        }
-
-        let deadline = Deadline::after(time_left);
-        let outcome = self.score_candidates(query, candidates, deadline, timings);
-        let Reranked::Complete { ranked, failed } = outcome else {
-            return Ok(None);
-        };
-        for (i, error) in failed {
-            match error.code() {
-                // The candidate was deleted since the search, or it is damaged. The others are
-                // answered without it.
-                ErrorCode::ReferenceNotFound | ErrorCode::CorruptRecord => {
-                    self.withdraw(plan, candidates[i].id);
-                }
-                _ => return Err(error.into()),
-            }
-        }
-
-        let scored = ranked.into_iter().map(|ranked| RankedNeighbour {
-            neighbour: candidates[ranked.candidate],
-            score: Some(ranked.score),
-        });
-        Ok(Some(scored.collect()))
-    }
-
-    /// Matches the key patches of the query with those of each candidate, which are loaded from the
-    /// cache or the store on the way.
-    fn score_candidates(
-        &self,
-        query: &Descriptor,
-        candidates: &[Neighbour],
-        deadline: Deadline,
-        timings: &mut Timings,
-    ) -> Reranked<StoreError> {
-        let started = Instant::now();
-        let loading_ns = AtomicU64::new(0);
-        // Loading runs on other threads; their log lines belong to this request all the same.
-        let span = tracing::Span::current();
-        let load = |i: usize| {
-            let begun = Instant::now();
-            let loaded = span.in_scope(|| self.patches.load(&*self.store, candidates[i].id));
-            loading_ns.fetch_add(begun.elapsed().as_nanos() as u64, Ordering::Relaxed);
-            loaded
-        };
-        let count = candidates.len();
-        let outcome = self
-            .reranker
-            .rerank(&query.patches, count, load, Some(deadline));
-        self.record_rerank(started.elapsed(), loading_ns.into_inner(), timings);
-        outcome
-    }
-
-    /// Splits the time of re-ranking into loading and matching. Loading runs within re-ranking on
-    /// all threads at once, so that its share of the `wall` time is its sum by their number.
-    fn record_rerank(&self, wall: Duration, loading_ns: u64, timings: &mut Timings) {
-        let threads = rayon::current_num_threads().max(1) as u64;
-        let loading = Duration::from_nanos(loading_ns / threads).min(wall);
-        timings.record(&self.metrics, PipelineStage::Load, loading);
-        timings.record(&self.metrics, PipelineStage::Rerank, wall - loading);
-    }
-
     /// Takes a reference that the store did not return out of the map's index, so that it is not
     /// found again, and reports it if it was lost.
     ///
     /// A reference leaves the store only by being deleted or, if it is damaged, by being replaced;
     /// both take it out of the index, too, while they keep the map's entry locked. So a reference
-    /// that is still in the index while nobody else has that lock, but is unknown to the store, was
-    /// lost by the database.
-    fn withdraw(&self, plan: &QueryPlan, id: ReferenceId) {
+    /// that is still in the index while nobody else has that lock, but is unknown to the store,
+    /// was lost by the database.
+    pub(super) fn withdraw(&self, plan: &QueryPlan, id: ReferenceId) {
         let entry = self.maps.entry(&plan.name);
         let _no_change_under_way = entry.lock_for_change();
         let was_in_index = plan.map.index.remove(id);
@@ -414,36 +337,44 @@ impl Service {
         &self,
         plan: &QueryPlan,
         best: Option<&QueryResult>,
-        reranked: bool,
-        sighting: Option<&Sighting>,
+        trust: &Trust<'_>,
     ) -> MatchConfidence {
-        let of_track = plan.frame.as_ref().and(sighting);
-        let probability = of_track.map(|sighting| {
-            let best = best.map(|best| best.reference.id);
-            sighting.probability(best)
-        });
-        let best = best.map(|best| BestAnswer {
-            spatial_score: best.score.as_ref().map(|score| score.spatial_score),
-            global_distance: best.global_distance,
-        });
-        let own = plan.map.calibration();
-        let (model, own) = (&plan.map.model, own.as_deref());
-        match probability {
-            Some(probability) => self.calibrations.judge(model, own, reranked, probability),
-            None => self.calibrations.assess(model, own, best),
-        }
+        let confidence = self.judge(plan, best, trust);
+        let score = best.and_then(|best| best.score.as_ref());
+        let spatial_score = score.map_or(0, |score| score.pair.spatial_score);
+        let top1_score = trust.ranked_by.map(|_| spatial_score);
+        self.metrics.query_answered(top1_score, confidence.matched);
+        confidence
     }
 
-    /// Counts an answer with its best result in the metrics.
-    fn count_answer(
+    fn judge(
         &self,
+        plan: &QueryPlan,
         best: Option<&QueryResult>,
-        reranked: bool,
-        confidence: MatchConfidence,
-    ) {
-        let score = best.and_then(|best| best.score.as_ref());
-        let spatial_score = score.map_or(0, |score| score.spatial_score);
-        let top1_score = reranked.then_some(spatial_score);
-        self.metrics.query_answered(top1_score, confidence.matched);
+        trust: &Trust<'_>,
+    ) -> MatchConfidence {
+        if trust.shows_nothing {
+            return MatchConfidence::unmatched(UnmatchedReason::ImageUninformative);
+        }
+        let model = &plan.map.model;
+        if let Some(sighting) = plan.frame.as_ref().and(trust.sighting) {
+            let best = best.map(|best| best.reference.id);
+            let probability = sighting.probability(best);
+            let is_reranked = trust.ranked_by.is_some();
+            return self
+                .calibrations
+                .judge(model, trust.own, is_reranked, probability);
+        }
+        let best = best.map(|best| {
+            let value = best.score.as_ref().map(|score| score.value);
+            BestAnswer {
+                evidence: trust
+                    .ranked_by
+                    .zip(value)
+                    .map(|(by, value)| by.evidence(value)),
+                global_distance: best.global_distance,
+            }
+        });
+        self.calibrations.assess(model, trust.own, best)
     }
 }

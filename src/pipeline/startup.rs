@@ -68,7 +68,8 @@ impl Service {
         } = parts;
         config.check()?;
         tracks.check()?;
-        let calibrations = Calibrations::new(rerank.id());
+        let calibrations = Calibrations::new(&rerank);
+        calibrations.warn_if_nothing_learned(source.model_id());
         let maps = build_indexes(&*store, &*source, &health)?;
         for (name, live) in maps.all() {
             calibrations.warn_if_unusable(&name, live.calibration().as_deref());

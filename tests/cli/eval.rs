@@ -65,6 +65,19 @@ fn eval_calibrate_takes_the_same_data_and_its_own_options() {
             "eval calibrate --dataset utm --root /nowhere --no-rerank",
             "--no-rerank",
         ),
+        (
+            "eval calibrate --dataset utm --root /nowhere --score best",
+            "learned",
+        ),
+        (
+            "eval calibrate --dataset utm --root /nowhere --quarters middle",
+            "east-quarter",
+        ),
+        (
+            "eval calibrate --dataset utm --root /nowhere --out x.json \
+             --quarters east-quarter,west-quarter",
+            "one calibration",
+        ),
         ("eval --dataset utm --root /nowhere calibrate", "calibrate"),
     ] {
         let error = refusal(&words(arguments), folder.path());
@@ -329,6 +342,40 @@ fn a_calibration_is_fitted_and_judged_elsewhere() {
 }
 
 #[test]
+fn a_score_is_learned_judged_and_used() {
+    if !has_model() {
+        return;
+    }
+    let town = town("8", "2");
+    let folder = town.path();
+    let learn = words(
+        "calibrate --score learned --leave-out always --target-precision 0.8 --out own.json \
+         --radius 2 --quarters east-quarter",
+    );
+    let mut arguments = eval(&[]);
+    arguments.splice(1..1, learn);
+    let text = succeeds(folder, &arguments);
+    let rows = ["east-quarter held out", "paper ", "fused ", "learned "];
+    assert!(rows.iter().all(|row| text.contains(row)), "{text}");
+    let bytes = std::fs::read(folder.join("own.json")).unwrap();
+    let calibration: Calibration = serde_json::from_slice(&bytes).unwrap();
+    let score = calibration.learned_score().expect("a score was learned");
+    assert!(score.terms().iter().any(|term| term.weight != 0.0));
+
+    let learned = ["--score", "learned"];
+    let error = program::refusal(folder, &eval(&learned));
+    assert!(error.contains("--calibration"), "{error}");
+    let with_own = [&learned[..], &["--calibration", "own.json"]].concat();
+    let text = succeeds(folder, &eval(&with_own));
+    assert!(text.contains("of the calibration given"), "{text}");
+    // It was fitted on the features of these combinations only.
+    let other_scales = [&with_own[..], &["--scales", "1"]].concat();
+    let error = program::refusal(folder, &eval(&other_scales));
+    assert!(error.contains("re-ranking"), "{error}");
+    succeeds(folder, &eval(&["--score", "fused"]));
+}
+
+#[test]
 fn the_ablation_marks_its_base_once_on_every_axis() {
     if !has_model() {
         return;
@@ -356,6 +403,7 @@ fn the_ablation_marks_its_base_once_on_every_axis() {
             "exit block",
             "input size",
             "scales",
+            "score",
             "tau"
         ]
         .map(|axis| (axis, 1))

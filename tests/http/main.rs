@@ -28,6 +28,7 @@ mod photo_metadata;
 mod process;
 mod rehead;
 mod routes;
+mod scores;
 mod slow_clients;
 mod surface;
 mod tls;

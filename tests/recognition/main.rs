@@ -13,5 +13,6 @@ mod image_golden;
 mod image_inputs;
 mod image_limits;
 mod jpeg;
+mod mirrored;
 mod pictures;
 mod town;

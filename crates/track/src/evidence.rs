@@ -32,10 +32,11 @@ impl<'a> Evidence<'a> {
     }
 
     /// Logarithm of how much likelier these scores are at the right place than at a wrong one;
-    /// `spatial_score` is `None` where nothing was re-ranked.
-    pub fn log_ratio(&self, spatial_score: Option<f64>, global_distance: f64) -> f64 {
+    /// `evidence` is what the score of a candidate counts for in its calibration (S: ln(1 + S)),
+    /// `None` where nothing was re-ranked.
+    pub fn log_ratio(&self, evidence: Option<f64>, global_distance: f64) -> f64 {
         let weights = &self.curve.weights;
-        let confidence = weights.confidence(spatial_score, global_distance);
+        let confidence = weights.confidence(evidence, global_distance);
         let confidence = confidence.clamp(SMALLEST_DOUBT, 1.0 - SMALLEST_DOUBT);
         (confidence / (1.0 - confidence)).ln() - self.prior_odds.ln()
     }

@@ -63,7 +63,7 @@ impl MeasuredService for RunningPipeline {
         };
         let querying = self.service.query(&Caller::Local, request);
         let answer = self.runtime.block_on(querying)?;
-        Ok(answer.reranked)
+        Ok(answer.ranked_by.is_some())
     }
 
     fn ingest(&self, map: &MapName, photos: &[Bytes], at_once: usize) -> Result<(), ServiceError> {

@@ -4,7 +4,7 @@ use crate::cli::choice::choice;
 use crate::cli::data_args::ReadArgs;
 use crate::cli::output::note;
 use anyhow::{bail, ensure};
-use placeformer_core::types::ScaleSet;
+use placeformer_core::types::{ScaleSet, ScoreKind};
 use placeformer_lab::choice::Choice;
 use placeformer_lab::datasets::{self, Dataset, DatasetKind, DatasetOptions, GroundPart};
 use placeformer_lab::eval::features::{Describe, FeatureCache, GlobalKind};
@@ -122,6 +122,15 @@ pub(super) struct RerankArgs {
         value_name = "SET"
     )]
     pub(super) scales: Vec<ScaleSet>,
+    /// What candidates are ordered by: the number of inliers, that fused with the global distance,
+    /// or a score learned by `eval calibrate`.
+    #[arg(
+        long,
+        value_parser = parse_score,
+        default_value = "paper",
+        value_name = "paper|fused|learned"
+    )]
+    pub(super) score: ScoreKind,
 }
 
 /// Whether and how queries are followed as the frames of a drive.
@@ -217,6 +226,12 @@ pub(super) struct CacheArgs {
     patch_memory: u64,
 }
 
+fn parse_score(text: &str) -> Result<ScoreKind, String> {
+    let mut kinds = ScoreKind::ALL.into_iter();
+    let known = kinds.find(|kind| kind.as_str() == text);
+    known.ok_or_else(|| "use paper, fused or learned".to_owned())
+}
+
 impl DataArgs {
     pub(super) fn load(&self) -> anyhow::Result<Dataset> {
         let options = DatasetOptions {
@@ -284,6 +299,7 @@ impl RerankArgs {
     pub(super) fn config(&self) -> RerankConfig {
         RerankConfig {
             scales: self.scales.clone(),
+            score: self.score,
             ..Default::default()
         }
     }

@@ -5,9 +5,9 @@ use super::{describe, open_describer, write};
 use crate::cli::model_args::ModelOptions;
 use crate::cli::output::{note, say_part};
 use crate::cli::progress::ProgressBars;
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use maud::html;
-use placeformer_core::types::{Calibration, ConfidenceCurve};
+use placeformer_core::types::{Calibration, ConfidenceCurve, ScoreKind};
 use placeformer_lab::datasets::{Dataset, DatasetKind};
 use placeformer_lab::eval::ablate::{Ablation, Base, ablate};
 use placeformer_lab::eval::answers::DatasetAnswers;
@@ -20,8 +20,9 @@ use placeformer_lab::eval::sequences::{SequenceRun, measure_sequences};
 use placeformer_lab::eval::summarise::summarise;
 use placeformer_lab::eval::summary::{RunConfig, Summary};
 use placeformer_lab::eval::{EvalError, prediction, report};
+use placeformer_models::built_in_calibration;
 use placeformer_vision::extract::ExtractConfig;
-use placeformer_vision::rerank::{RerankConfig, Reranker};
+use placeformer_vision::rerank::{Ranking, RerankConfig, Reranker, feature_names};
 use std::path::Path;
 
 /// Arguments of an evaluation without a further subcommand.
@@ -115,13 +116,14 @@ fn measure(
     let progress = ProgressBars::default();
     let cache = &args.output.cache;
     let described = describe(describer, cache, dataset, method.global, &progress)?;
-    let answers = described.answer(
+    let mut answers = described.answer(
         dataset,
         own.as_ref(),
         config.candidates,
         config.rerank.as_ref(),
         &progress,
     )?;
+    order(&mut answers, &config, given.as_ref())?;
     let mut summary = summarise(
         dataset,
         &described.database,
@@ -132,6 +134,11 @@ fn measure(
     );
     if let Some(options) = args.sequences.options(method.seed)? {
         let config = summary.config.clone();
+        let score = config.rerank.as_ref().map(|rerank| rerank.score);
+        ensure!(
+            score.is_none_or(|score| score == ScoreKind::Paper),
+            "--sequences measures tracks by S: leave --score out"
+        );
         let run = SequenceRun {
             dataset,
             described: &described,
@@ -155,6 +162,33 @@ fn curve(config: &RunConfig, given: Option<&Calibration>) -> anyhow::Result<Conf
         "the model has no calibration for this re-ranking, which tracks need: fit one with \
          `eval calibrate --out`, and give it with --calibration",
     )
+}
+
+/// Orders the candidates by the score of `config`. A learned one comes from the calibration given,
+/// or from the model's own.
+fn order(
+    answers: &mut DatasetAnswers,
+    config: &RunConfig,
+    given: Option<&Calibration>,
+) -> anyhow::Result<()> {
+    let Some(rerank) = &config.rerank else {
+        return Ok(());
+    };
+    match rerank.score {
+        ScoreKind::Paper => {}
+        ScoreKind::Fused => answers.order_by(&Ranking::Fused),
+        ScoreKind::Learned => {
+            let shipped = built_in_calibration(&config.model);
+            let calibrations = given.into_iter().chain(shipped.as_ref());
+            let mut learned = calibrations.filter_map(Calibration::learned_score);
+            let score = learned.next().context(
+                "the model has no learned score: give one of eval calibrate by --calibration",
+            )?;
+            score.check_features(&feature_names(&rerank.scales))?;
+            answers.order_by(&Ranking::Learned(score));
+        }
+    }
+    Ok(())
 }
 
 fn read_calibration(path: &Path) -> anyhow::Result<Calibration> {
@@ -205,6 +239,7 @@ fn run_ablation(
         backbones: &backbones,
         cache: &args.output.cache.folder()?,
         memory_bytes: args.output.cache.memory_bytes(),
+        radius_m: args.data.radius,
     };
     let open = |config: &ExtractConfig| -> Result<Box<dyn Describe>, EvalError> {
         match open_describer(config) {

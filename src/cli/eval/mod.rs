@@ -51,6 +51,10 @@ enum Action {
     /// alone for the others. An answer is trusted from the confidence on at which the share of
     /// right ones reaches --target-precision (cross-validated, never below 0.5).
     ///
+    /// With --score learned, a score of candidates is fitted as well, to all that re-ranking finds
+    /// out about them: a logistic regression that goes into the calibration. --quarters says what
+    /// each way of ordering candidates is worth on ground that nothing was fitted on.
+    ///
     /// Queries without a match come from the ground truth (an empty reference). Where it has none,
     /// every query is asked twice, the second time with its own place left out of the database: its
     /// positives and, where positions are known, all images within four times the radius.

@@ -5,7 +5,7 @@ use crate::http::problem::ApiError;
 use crate::http::state::AppState;
 use axum::Json;
 use axum::extract::State;
-use placeformer_core::types::Calibration;
+use placeformer_core::types::{Calibration, ScoreKind};
 use serde::Serialize;
 use utoipa::ToSchema;
 
@@ -23,6 +23,8 @@ pub struct InfoBody {
     /// Scale combinations whose inliers add up to S.
     #[schema(example = json!(["1", "1+2", "2+3"]))]
     pub scales: Vec<String>,
+    /// What candidates are ordered by, where what that takes is known.
+    pub score: ScoreKind,
     /// What `matched` and `confidence` come from on maps without a calibration of their own; null:
     /// they are null there.
     pub calibration: Option<Calibration>,
@@ -69,6 +71,7 @@ pub async fn info(State(state): State<AppState>) -> Result<Json<InfoBody>, ApiEr
             height: info.input_size.height,
         },
         scales: info.rerank.scales.iter().map(ToString::to_string).collect(),
+        score: info.rerank.score,
         calibration: info.calibration,
         limits: LimitsBody {
             max_image_bytes: state.max_image_bytes,

@@ -15,7 +15,8 @@ use axum::extract::{Request, State};
 use axum::http::StatusCode;
 use axum::response::Response;
 use placeformer_core::types::{
-    Altitude, Deadline, GeoCircle, GeoPoint, Heading, MapName, Metadata, ReferenceFilter, Timestamp,
+    Altitude, Deadline, GeoCircle, GeoPoint, Heading, MapName, Metadata, ReferenceFilter,
+    ScoreKind, Timestamp,
 };
 use placeformer_track::Estimate;
 use placeformer_vision::rerank::PairScore;
@@ -212,13 +213,17 @@ pub struct QueryAnswerBody {
     /// Whether the candidates were re-ranked; the order is then that of S, else that of global
     /// distance. In a track it is that of the probability by all that is known.
     pub reranked: bool,
+    /// What re-ranked candidates are ordered by: the number of inliers S (`paper`), S fused with
+    /// the global distance (`fused`), or a learned score (`learned`); null if nothing was
+    /// re-ranked.
+    pub ranked_by: Option<ScoreKind>,
     /// Whether the first result is trusted: its confidence reaches the threshold of the map's
-    /// calibration, else of the model's. False without any result, and for a photo that shows nothing
-    /// to know a place by; else null if there is no calibration. In a track the confidence is that of
-    /// the track.
+    /// calibration, else of the model's. False without any result, and for a photo that shows
+    /// nothing to know a place by; else null if there is no calibration. In a track the confidence
+    /// is that of the track.
     pub matched: Option<bool>,
-    /// Probability that the first result shows the right place; 0 without any result, and for a photo
-    /// that shows nothing to know a place by; else null if there is no calibration.
+    /// Probability that the first result shows the right place; 0 without any result, and for a
+    /// photo that shows nothing to know a place by; else null if there is no calibration.
     #[schema(minimum = 0, maximum = 1, example = 0.97)]
     pub confidence: Option<f64>,
     /// Why the first result is not trusted; null if it is, or if there is no calibration.
@@ -238,9 +243,9 @@ pub struct QueryAnswerBody {
     pub model: String,
 }
 
-/// Why a first result is not trusted: there is none (`no_results`), the photo shows nothing by which
-/// a place could be known (`image_uninformative`: a dark or blank frame, a covered lens), or its
-/// confidence is below the threshold (`low_confidence`).
+/// Why a first result is not trusted: there is none (`no_results`), the photo shows nothing by
+/// which a place could be known (`image_uninformative`: a dark or blank frame, a covered lens), or
+/// its confidence is below the threshold (`low_confidence`).
 #[derive(Debug, Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum UnmatchedReasonName {
@@ -339,7 +344,11 @@ pub struct QueryResultBody {
     pub location: Option<LocationBody>,
     /// Euclidean distance of the global descriptors, 0 to 2.
     pub global_distance: f32,
-    /// S, the number of inliers over all scale combinations; null if this result was not re-ranked.
+    /// What the re-ranked results are ordered by, the largest first (`ranked_by`); null if this
+    /// result was not re-ranked.
+    pub score: Option<f64>,
+    /// S, the number of inliers over all scale combinations; null if this result was not
+    /// re-ranked.
     pub spatial_score: Option<u32>,
     /// S by scale combination; null if this result was not re-ranked.
     #[schema(example = json!({
@@ -365,14 +374,16 @@ pub struct CombinationBody {
 
 impl QueryResultBody {
     fn new(position: usize, result: QueryResult) -> Self {
+        let pair = result.score.as_ref().map(|score| &score.pair);
         Self {
             rank: position + 1,
             reference_id: result.reference.id.to_string(),
             location: location(&result.reference),
             external_id: result.reference.fields.external_id.map(String::from),
             global_distance: result.global_distance,
-            spatial_score: result.score.as_ref().map(|score| score.spatial_score),
-            scores: result.score.as_ref().map(scores),
+            score: result.score.as_ref().map(|score| score.value),
+            spatial_score: pair.map(|pair| pair.spatial_score),
+            scores: pair.map(scores),
             captured_at: result.reference.fields.captured_at,
             metadata: result.reference.fields.metadata,
         }
@@ -451,7 +462,8 @@ fn answer_body(answer: QueryAnswer) -> QueryAnswerBody {
     }
     QueryAnswerBody {
         results,
-        reranked: answer.reranked,
+        reranked: answer.ranked_by.is_some(),
+        ranked_by: answer.ranked_by,
         matched: answer.confidence.matched,
         confidence: answer.confidence.confidence,
         unmatched_reason: answer.confidence.reason.map(Into::into),

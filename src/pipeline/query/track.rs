@@ -6,7 +6,7 @@ use crate::ops::PipelineStage;
 use crate::pipeline::maps::LiveMap;
 use crate::pipeline::tracks::{Frame, Localisation, Sighting};
 use crate::pipeline::{PipelineError, Service, Timings, TrackAnswer, TrackOptions};
-use placeformer_core::types::{MapName, ReferenceId, Timestamp};
+use placeformer_core::types::{MapName, ReferenceId, ScoreKind, Timestamp};
 use placeformer_track::Evidence;
 use placeformer_vision::search::Neighbour;
 use std::time::Instant;
@@ -87,20 +87,18 @@ impl Service {
         plan: &QueryPlan,
         localisation: Option<Localisation>,
         ranking: &mut [RankedNeighbour],
-        reranked: bool,
+        ranked_by: Option<ScoreKind>,
         timings: &mut Timings,
     ) -> Option<Sighting> {
         let started = Instant::now();
         let own = plan.map.calibration();
-        let curve = self
-            .calibrations
-            .curve(&plan.map.model, own.as_deref(), reranked)?;
+        let curve =
+            self.calibrations
+                .curve(&plan.map.model, own.as_deref(), ranked_by.is_some())?;
         let scores = ranking.iter().map(|ranked| {
-            let score = ranked
-                .score
-                .as_ref()
-                .map(|score| f64::from(score.spatial_score));
-            (ranked.neighbour.id, score, ranked.neighbour.distance)
+            let value = ranked.score.as_ref().map(|score| score.value);
+            let evidence = ranked_by.zip(value).map(|(by, value)| by.evidence(value));
+            (ranked.neighbour.id, evidence, ranked.neighbour.distance)
         });
         let sighting = localisation?.weigh(scores, Evidence::new(curve));
         if plan.frame.is_some() {

@@ -1,32 +1,37 @@
 //! How far a best answer can be trusted: from its score and distance to a probability, and from
 //! that to yes or no.
 //!
-//! A [`Calibration`] holds two curves, because an answer that was not re-ranked has no S and needs
-//! an honest confidence of its own. It says how it was fitted and for which model and re-ranking
-//! it holds; anywhere else its numbers mean nothing. As JSON it is a file, a column of the store
-//! and a body of the web surface alike.
+//! A [`Calibration`] holds two curves, because an answer that was not re-ranked has no score and
+//! needs an honest confidence of its own. Where candidates are ranked by a learned score, it holds
+//! that, too, because its curve means nothing without it. It says how it was fitted and for which
+//! model and re-ranking it holds; anywhere else its numbers mean nothing. As JSON it is a file, a
+//! column of the store and a body of the web surface alike.
 
 use super::ids::{ModelId, RerankId};
+use super::score::{LearnedScore, ScoreKind};
 use crate::invalid::InvalidValue;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-/// The version of the JSON that this release reads and writes.
+/// The version of the JSON without a learned score, as the first release wrote it.
 const FORMAT: u32 = 1;
-/// Largest magnitude of a weight. S is below a million and a distance at most 2, so that no sum of
-/// such weights overflows.
+/// The version with one.
+const FORMAT_WITH_SCORE: u32 = 2;
+/// Largest magnitude of a weight. Scores are logarithms and a distance is at most 2, so that no
+/// sum of such weights overflows.
 const LARGEST_WEIGHT: f64 = 1e6;
 /// Longest name of the data a calibration was fitted on, in characters.
 const LONGEST_DATA: usize = 200;
 
-/// Weights of a logistic curve: confidence = sigmoid(bias + score ln(1 + S) + distance d).
+/// Weights of a logistic curve: confidence = sigmoid(bias + score e + distance d). The evidence e
+/// is ln(1 + S) where candidates are ranked by S, else the score that they are ranked by.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ConfidenceWeights {
     /// Constant term.
     pub bias: f64,
-    /// Weight of ln(1 + S), not negative: more inliers never make an answer less sure. 0 in a
-    /// curve without S.
+    /// Weight of the evidence, not negative: more inliers never make an answer less sure. 0 in a
+    /// curve without a score.
     #[schema(minimum = 0)]
     pub score: f64,
     /// Weight of the global distance, not positive: a farther answer is never surer.
@@ -35,10 +40,10 @@ pub struct ConfidenceWeights {
 }
 
 impl ConfidenceWeights {
-    /// Probability, 0 to 1, that an answer with this S (`None`: not re-ranked) and Euclidean
-    /// distance is right.
-    pub fn confidence(&self, spatial_score: Option<f64>, global_distance: f64) -> f64 {
-        let evidence = self.score * spatial_score.unwrap_or(0.0).max(0.0).ln_1p();
+    /// Probability, 0 to 1, that an answer with this evidence (see [`ScoreKind::evidence`];
+    /// `None`: not re-ranked) and Euclidean distance is right.
+    pub fn confidence(&self, evidence: Option<f64>, global_distance: f64) -> f64 {
+        let evidence = self.score * evidence.unwrap_or(0.0);
         let logit = self.bias + evidence + self.distance * global_distance;
         1.0 / (1.0 + (-logit).exp())
     }
@@ -125,12 +130,12 @@ impl ConfidenceCurve {
 #[serde(try_from = "UncheckedCalibration", deny_unknown_fields)]
 pub struct Calibration {
     /// Version of this JSON.
-    #[schema(minimum = 1, maximum = 1)]
+    #[schema(minimum = 1, maximum = 2)]
     format: u32,
     /// The model whose distances and scores it was fitted on.
     #[schema(value_type = String)]
     model: ModelId,
-    /// The re-ranking whose S it was fitted on.
+    /// The re-ranking whose scores it was fitted on.
     #[schema(value_type = String, example = "1,1+2,2+3:t1.5:i2000:c0.995")]
     rerank: RerankId,
     /// Name of the data it was fitted on.
@@ -143,6 +148,10 @@ pub struct Calibration {
     reranked: ConfidenceCurve,
     /// For answers that were not: by distance alone.
     global: ConfidenceCurve,
+    /// What candidates are ranked by, where the re-ranking is by a learned score; format 2.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = LearnedScore, required = false)]
+    learned_score: Option<LearnedScore>,
 }
 
 /// The fields of a [`Calibration`] before they are checked.
@@ -156,23 +165,42 @@ struct UncheckedCalibration {
     target_precision: f64,
     reranked: ConfidenceCurve,
     global: ConfidenceCurve,
+    #[serde(default)]
+    learned_score: Option<LearnedScore>,
 }
 
 impl TryFrom<UncheckedCalibration> for Calibration {
     type Error = InvalidValue;
 
     fn try_from(raw: UncheckedCalibration) -> Result<Self, Self::Error> {
-        if raw.format != FORMAT {
-            let reason = format!("{} is not known; this release reads {FORMAT}", raw.format);
+        if !(FORMAT..=FORMAT_WITH_SCORE).contains(&raw.format) {
+            let reason = format!(
+                "{} is not known; this release reads {FORMAT} and {FORMAT_WITH_SCORE}",
+                raw.format
+            );
             return Err(InvalidValue::new("format", reason));
         }
-        Self::new(
+        let has_score = raw.format == FORMAT_WITH_SCORE;
+        if has_score != raw.learned_score.is_some() {
+            let reason = "it belongs to format 2, and that to it";
+            return Err(InvalidValue::new("learned_score", reason));
+        }
+        let is_learned = raw.rerank.score() == ScoreKind::Learned;
+        let calibration = Self::new(
             raw.model,
             raw.rerank,
             raw.data,
             raw.target_precision,
             [raw.reranked, raw.global],
-        )
+        )?;
+        match raw.learned_score {
+            Some(score) => calibration.with_score(score),
+            None if is_learned => {
+                let reason = "the re-ranking is by a learned score, so it must be given";
+                Err(InvalidValue::new("learned_score", reason))
+            }
+            None => Ok(calibration),
+        }
     }
 }
 
@@ -210,7 +238,29 @@ impl Calibration {
             target_precision,
             reranked,
             global,
+            learned_score: None,
         })
+    }
+
+    /// The same with the score that candidates are ranked by.
+    ///
+    /// # Errors
+    /// The re-ranking is not by a learned score.
+    pub fn with_score(self, score: LearnedScore) -> Result<Self, InvalidValue> {
+        if self.rerank.score() != ScoreKind::Learned {
+            let reason = format!("the re-ranking {} is not by a learned score", self.rerank);
+            return Err(InvalidValue::new("learned_score", reason));
+        }
+        Ok(Self {
+            format: FORMAT_WITH_SCORE,
+            learned_score: Some(score),
+            ..self
+        })
+    }
+
+    /// What candidates are ranked by, where that was learned.
+    pub fn learned_score(&self) -> Option<&LearnedScore> {
+        self.learned_score.as_ref()
     }
 
     /// The model it holds for.
@@ -218,7 +268,8 @@ impl Calibration {
         &self.model
     }
 
-    /// The re-ranking whose S it was fitted on; answers by distance alone do not depend on it.
+    /// The re-ranking whose scores it was fitted on; answers by distance alone do not depend on
+    /// it.
     pub fn rerank(&self) -> &RerankId {
         &self.rerank
     }
@@ -253,121 +304,4 @@ fn check_share(field: &'static str, value: f64) -> Result<(), InvalidValue> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-    use serde_json::{Value, json};
-
-    fn curve(score: f64) -> Value {
-        json!({
-            "weights": {"bias": -4.5, "score": score, "distance": -2.25},
-            "threshold": 0.75,
-            "right": 90,
-            "wrong": 40,
-            "without_match": 30,
-            "precision": 0.99,
-            "recall": 0.875,
-            "expected_calibration_error": 0.02
-        })
-    }
-
-    fn whole() -> Value {
-        json!({
-            "format": 1,
-            "model": "m",
-            "rerank": "r",
-            "data": "town",
-            "target_precision": 0.99,
-            "reranked": curve(1.5),
-            "global": curve(0.0)
-        })
-    }
-
-    #[test]
-    fn json_survives_and_keeps_its_shape() {
-        let read: Calibration = serde_json::from_value(whole()).unwrap();
-        assert_eq!(serde_json::to_value(&read).unwrap(), whole());
-        assert_eq!(
-            (
-                read.model().as_str(),
-                read.rerank().as_str(),
-                read.curve(true).right
-            ),
-            ("m", "r", 90)
-        );
-    }
-
-    #[test]
-    fn values_out_of_range_are_refused_by_name() {
-        for (pointer, value, named) in [
-            ("/format", json!(2), "format"),
-            ("/target_precision", json!(1.5), "target_precision"),
-            ("/data", json!("x".repeat(201)), "data"),
-            ("/reranked/threshold", json!(-0.1), "threshold"),
-            ("/reranked/weights/score", json!(-1), "score"),
-            ("/global/weights/distance", json!(0.5), "distance"),
-            ("/global/weights/score", json!(0.5), "global"),
-            ("/global/right", json!(-1), "-1"),
-            ("/global/recall", Value::Null, "null"),
-            ("/reranked/weights/bias", json!(1e308), "bias"),
-            ("/reranked/weights/score", json!(1e308), "score"),
-            ("/reranked/weights/distance", json!(-1e308), "distance"),
-            ("/global/without_match", json!(41), "without_match"),
-        ] {
-            let mut changed = whole();
-            *changed.pointer_mut(pointer).unwrap() = value;
-            let error = serde_json::from_value::<Calibration>(changed)
-                .unwrap_err()
-                .to_string();
-            assert!(error.contains(named), "{pointer}: {error}");
-        }
-        let mut more = whole();
-        more["reranked"]["comment"] = json!("x");
-        assert!(
-            serde_json::from_value::<Calibration>(more)
-                .unwrap_err()
-                .to_string()
-                .contains("comment")
-        );
-        let endless = ConfidenceWeights {
-            bias: f64::INFINITY,
-            score: 0.0,
-            distance: 0.0,
-        };
-        let read: Calibration = serde_json::from_value(whole()).unwrap();
-        let broken = ConfidenceCurve {
-            weights: endless,
-            ..read.curve(false).clone()
-        };
-        let built = Calibration::new(
-            ModelId::new("m"),
-            RerankId::new("r"),
-            "",
-            0.9,
-            [broken.clone(), broken],
-        );
-        assert!(built.unwrap_err().to_string().contains("bias"));
-    }
-
-    /// Two numbers below `end`, the smaller first.
-    fn ordered(end: f64) -> impl Strategy<Value = (f64, f64)> {
-        (0.0..end, 0.0..end).prop_map(|(a, b)| (a.min(b), a.max(b)))
-    }
-
-    proptest! {
-        #[test]
-        fn confidence_is_a_probability_that_follows_the_evidence(
-            bias in prop_oneof![-50.0..50.0f64, -LARGEST_WEIGHT..=LARGEST_WEIGHT],
-            score in prop_oneof![0.0..10.0f64, 0.0..=LARGEST_WEIGHT],
-            distance in prop_oneof![-20.0..0.0f64, -LARGEST_WEIGHT..=0.0],
-            (fewer, more) in ordered(2000.0),
-            (near, far) in ordered(2.0),
-        ) {
-            let weights = ConfidenceWeights { bias, score, distance };
-            let confidence = weights.confidence(Some(fewer), far);
-            prop_assert!((0.0..=1.0).contains(&confidence));
-            prop_assert!(confidence <= weights.confidence(Some(more), far));
-            prop_assert!(confidence <= weights.confidence(Some(fewer), near));
-        }
-    }
-}
+mod tests;

@@ -1,5 +1,6 @@
 //! Identifiers, each checked where it enters.
 
+use super::score::ScoreKind;
 use crate::invalid::InvalidName;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -185,7 +186,8 @@ impl fmt::Display for ModelId {
     }
 }
 
-/// What S depends on beyond the descriptors: the settings of re-ranking as one printable string.
+/// What the order of candidates depends on beyond the descriptors: the settings of re-ranking as
+/// one printable string. It ends with the kind of score, if that is not the paper's.
 ///
 /// Scores compare meaningfully only if their `RerankId`s are equal.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -196,6 +198,22 @@ impl RerankId {
     /// Wraps the text that re-ranking composed or a calibration carries.
     pub fn new(text: impl Into<String>) -> Self {
         Self(text.into())
+    }
+
+    /// The identity of `settings` with candidates ordered by `score`.
+    pub fn with_score(settings: String, score: ScoreKind) -> Self {
+        match score {
+            ScoreKind::Paper => Self(settings),
+            ScoreKind::Fused | ScoreKind::Learned => Self(settings + ":" + score.as_str()),
+        }
+    }
+
+    /// What candidates are ordered by.
+    pub fn score(&self) -> ScoreKind {
+        let named = self.0.rsplit(':').next();
+        let mut kinds = ScoreKind::ALL.into_iter();
+        let kind = kinds.find(|kind| named == Some(kind.as_str()));
+        kind.unwrap_or_default()
     }
 
     /// The identity as text.

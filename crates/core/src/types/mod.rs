@@ -9,6 +9,7 @@ mod descriptor;
 mod ids;
 mod metadata;
 mod reference;
+mod score;
 mod timestamp;
 
 pub use crate::geography::{Altitude, GeoCircle, GeoPoint, Heading};
@@ -22,4 +23,5 @@ pub use descriptor::{
 pub use ids::{ContentHash, ExternalId, MapName, ModelId, ReferenceId, RerankId};
 pub use metadata::Metadata;
 pub use reference::{NewReference, Reference, ReferenceFields, ReferenceFilter};
+pub use score::{LearnedScore, ScoreKind, ScoreTerm};
 pub use timestamp::Timestamp;

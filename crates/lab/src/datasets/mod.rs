@@ -10,6 +10,7 @@
 //! | `kind`, `options` | which data set to read, and how |
 //! | `msls`, `nordland`, `pairs`, `robotcar`, `utm` | the readers |
 //! | `ground` | parts that share no place |
+//! | `quarter` | a part of the ground that is held out |
 //! | `layout`, `table`, `positions`, `zones`, `neighbours` | what several readers need |
 
 mod dataset;
@@ -24,6 +25,7 @@ mod options;
 mod pairs;
 mod pose;
 mod positions;
+mod quarter;
 mod robotcar;
 mod table;
 mod utm;
@@ -37,6 +39,7 @@ pub use neighbours::{NeighbourGrid, angle_between};
 pub use options::DatasetOptions;
 pub use pairs::load_pairs;
 pub use pose::Pose;
+pub use quarter::{Parted, Quarter};
 
 use std::path::Path;
 

@@ -1,5 +1,6 @@
-//! The axes of the paper's ablation tables as one table: scale combinations, tau, caps, input size,
-//! exit block, backbone, descriptor codec.
+//! The axes of the paper's ablation tables as one table: scale combinations, tau, caps, input
+//! size, exit block, backbone, descriptor codec; and what candidates are ordered by. A learned
+//! score is learned from the other places of the same data set (five-fold).
 //!
 //! Heads are bound to one backbone and exit block, so every row searches the mean patch token,
 //! which all have. Rows that differ only after extraction share its result: scale combinations and
@@ -13,16 +14,20 @@ mod variants;
 
 pub use variants::Base;
 
+use super::answers::DatasetAnswers;
 use super::error::EvalError;
 use super::features::{Describe, FeatureCache, Features, GlobalKind};
+use super::learn::{Lessons, order_unseen};
 use super::measure::{RECALL_AT, first_hit, recall_at};
 use super::run::{Answer, rerank_all, search_all};
 use super::summary::{AtK, Both};
 use crate::datasets::{Dataset, Truth};
 use cuts::{Codec, Components, Cut, SAMPLE, apply, unpack};
 use placeformer_core::progress::{Progress, Task};
+use placeformer_core::types::ScoreKind;
 use placeformer_store::codec;
 use placeformer_vision::extract::ExtractConfig;
+use placeformer_vision::rerank::{Ranking, RerankConfig};
 use serde::Serialize;
 use std::cell::OnceCell;
 use std::sync::Arc;
@@ -78,11 +83,11 @@ pub fn ablate(
         let features = Prepared::new(dataset, base, &group[0].extract, open, progress)?;
         for variant in group {
             match features.row(dataset, variant, progress)? {
-                Some(row) => table.rows.push(row),
-                None => table.left_out.push(format!(
-                    "{} {}: its descriptors need more memory than is allowed",
-                    variant.axis, variant.setting
-                )),
+                Ok(row) => table.rows.push(row),
+                Err(reason) => {
+                    let Variant { axis, setting, .. } = variant;
+                    table.left_out.push(format!("{axis} {setting}: {reason}"));
+                }
             }
             settings.add(1);
         }
@@ -94,6 +99,7 @@ pub fn ablate(
 struct Prepared {
     describer: Box<dyn Describe>,
     memory_bytes: u64,
+    radius_m: f64,
     cache: FeatureCache,
     database: Features,
     queries: Features,
@@ -130,6 +136,7 @@ impl Prepared {
         Ok(Self {
             describer,
             memory_bytes: base.memory_bytes,
+            radius_m: base.radius_m,
             cache,
             database,
             queries,
@@ -138,24 +145,30 @@ impl Prepared {
         })
     }
 
-    /// The row of `variant`; `None` where it needs more memory than is allowed.
+    /// The row of `variant`, or why it is left out.
     fn row(
         &self,
         dataset: &Dataset,
         variant: &Variant,
         progress: &dyn Progress,
-    ) -> Result<Option<AblationRow>, EvalError> {
+    ) -> Result<Result<AblationRow, String>, EvalError> {
         let queries = self.answers.len() as u64;
         let task = Task::begin(progress, variant.setting.clone(), queries);
         let measured = match variant.cut {
             Cut::FullPrecision => match self.in_full_precision(dataset, variant, &task)? {
                 Some(measured) => measured,
-                None => return Ok(None),
+                None => {
+                    let reason = "its descriptors need more memory than is allowed";
+                    return Ok(Err(reason.to_owned()));
+                }
             },
-            cut => self.cut(variant, cut, &task)?,
+            cut => match self.cut(dataset, variant, cut, &task) {
+                Err(error @ EvalError::OneSided { .. }) => return Ok(Err(error.to_string())),
+                measured => measured?,
+            },
         };
         let answers = &measured.answers;
-        Ok(Some(AblationRow {
+        Ok(Ok(AblationRow {
             axis: variant.axis,
             setting: variant.setting.clone(),
             recall: Both {
@@ -170,7 +183,13 @@ impl Prepared {
     }
 
     /// Re-ranks with what `cut` leaves of the stored key patches.
-    fn cut(&self, variant: &Variant, cut: Cut, task: &Task<'_>) -> Result<Measured, EvalError> {
+    fn cut(
+        &self,
+        dataset: &Dataset,
+        variant: &Variant,
+        cut: Cut,
+        task: &Task<'_>,
+    ) -> Result<Measured, EvalError> {
         let components = self.components(cut)?;
         let cache = &self.cache;
         let patches = |features: &Features, index: usize| {
@@ -188,6 +207,7 @@ impl Prepared {
             &variant.rerank,
             task,
         )?;
+        let answers = ordered(dataset, answers, &variant.rerank, self.radius_m)?;
         Ok(Measured {
             answers,
             rerank_seconds: seconds.rerank,
@@ -269,6 +289,28 @@ impl Prepared {
         }
         Ok(bytes / images.max(1) as f64)
     }
+}
+
+/// The answers in the order of the configured score.
+fn ordered(
+    dataset: &Dataset,
+    answers: Vec<Answer>,
+    rerank: &RerankConfig,
+    radius_m: f64,
+) -> Result<Vec<Answer>, EvalError> {
+    let mut asked = DatasetAnswers {
+        answers,
+        ..Default::default()
+    };
+    match rerank.score {
+        ScoreKind::Paper => {}
+        ScoreKind::Fused => asked.order_by(&Ranking::Fused),
+        ScoreKind::Learned => {
+            let lessons = Lessons::of(dataset, &asked, &rerank.scales, radius_m);
+            order_unseen(dataset, &mut asked, &lessons, 0)?;
+        }
+    }
+    Ok(asked.answers)
 }
 
 fn recall(

@@ -6,7 +6,7 @@ use super::own_places::OwnPlaces;
 use super::run::{Answer, QuerySeconds, rerank_all, search_all};
 use crate::datasets::Dataset;
 use placeformer_core::progress::{Progress, Task};
-use placeformer_vision::rerank::{PairScore, RerankConfig, Reranker};
+use placeformer_vision::rerank::{PairScore, Ranking, RerankConfig, Reranker};
 
 /// Both sides of a data set, described.
 pub struct DescribedDataset {
@@ -27,6 +27,26 @@ pub struct DatasetAnswers {
     pub left_out: Vec<Answer>,
     /// Mean seconds per query.
     pub seconds: QuerySeconds,
+}
+
+impl DatasetAnswers {
+    /// Orders all re-ranked candidates anew.
+    pub fn order_by(&mut self, ranking: &Ranking<'_>) {
+        for answer in self.answers.iter_mut().chain(&mut self.left_out) {
+            answer.order_by(ranking);
+        }
+    }
+
+    /// The answers to these queries, of which the numbers are given in ascending order.
+    pub fn only(&self, queries: &[usize]) -> Self {
+        let is_wanted = |answer: &&Answer| queries.binary_search(&answer.query).is_ok();
+        let kept = |answers: &[Answer]| answers.iter().filter(is_wanted).cloned().collect();
+        Self {
+            answers: kept(&self.answers),
+            left_out: kept(&self.left_out),
+            seconds: self.seconds,
+        }
+    }
 }
 
 impl DescribedDataset {
@@ -58,8 +78,9 @@ impl DescribedDataset {
         self.database.fresh + self.queries.fresh
     }
 
-    /// Answers every query as the service would, from `candidates` candidates; where `own` says so
-    /// a second time without its own place. Nothing is re-ranked without a configuration.
+    /// Answers every query as the service would, from `candidates` candidates, ordered by S; where
+    /// `own` says so a second time without its own place. Nothing is re-ranked without a
+    /// configuration.
     ///
     /// # Errors
     /// Key patches cannot be read from the cache.

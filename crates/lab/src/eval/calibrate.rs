@@ -5,13 +5,18 @@
 //! has none (or on demand) each query is asked twice: once as it is, and once with its own place
 //! left out of the database (see [`OwnPlaces`](super::own_places::OwnPlaces)).
 
+use super::answers::DatasetAnswers;
 use super::error::EvalError;
+use super::learn::{Lessons, order_unseen};
 use super::measure::{self, CalibrationError, ReliabilityBin, ThresholdCheck, TopOne, Trusted};
 use super::places::places_of;
 use super::run::Answer;
 use crate::datasets::{Dataset, Truth};
-use placeformer_core::types::{Calibration, ConfidenceCurve, ModelId, RerankId};
+use placeformer_core::types::{
+    Calibration, ConfidenceCurve, LearnedScore, ModelId, RerankId, ScoreKind,
+};
 use placeformer_models::built_in_calibration;
+use placeformer_vision::rerank::{Ranking, RerankConfig};
 use serde::Serialize;
 use std::fmt::{self, Write};
 
@@ -25,29 +30,32 @@ pub struct BestAnswers {
 }
 
 impl BestAnswers {
-    /// Of the answers to `dataset` as they are, and of `left_out`: answers to the same queries when
-    /// their own place was left out. Queries of unknown truth are passed over.
-    pub fn of(dataset: &Dataset, answers: &[Answer], left_out: &[Answer]) -> Self {
+    /// Of the answers to `dataset` as they are, and of `left_out`: answers to the same queries
+    /// when their own place was left out. Both are ordered by `score`. Queries of unknown truth
+    /// are passed over.
+    pub fn of(
+        dataset: &Dataset,
+        answers: &[Answer],
+        left_out: &[Answer],
+        score: ScoreKind,
+    ) -> Self {
         let places = places_of(dataset);
         let mut best = Self::default();
         let is_known = |answer: &&Answer| dataset.truth[answer.query] != Truth::Unknown;
         for answer in answers.iter().filter(is_known) {
-            best.add(
-                answer,
-                places[answer.query],
-                dataset.truth[answer.query].positives(),
-            );
+            let positives = dataset.truth[answer.query].positives();
+            best.add(answer, places[answer.query], positives, score);
         }
         for answer in left_out.iter().filter(is_known) {
-            best.add(answer, places[answer.query], &[]);
+            best.add(answer, places[answer.query], &[], score);
         }
         best
     }
 
-    fn add(&mut self, answer: &Answer, place: usize, positives: &[usize]) {
-        let judged = |index: usize, distance: f32, spatial_score: Option<f64>| TopOne {
+    fn add(&mut self, answer: &Answer, place: usize, positives: &[usize], score: ScoreKind) {
+        let judged = |index: usize, distance: f32, evidence: Option<f64>| TopOne {
             place,
-            spatial_score,
+            evidence,
             global_distance: f64::from(distance),
             correct: positives.binary_search(&index).is_ok(),
             has_match: !positives.is_empty(),
@@ -56,9 +64,9 @@ impl BestAnswers {
             self.global.push(judged(best.index, best.distance, None));
         }
         if let Some(best) = answer.reranked.first() {
-            let score = f64::from(best.score.spatial_score);
+            let evidence = score.evidence(best.value);
             self.reranked
-                .push(judged(best.index, best.distance, Some(score)));
+                .push(judged(best.index, best.distance, Some(evidence)));
         }
     }
 }
@@ -87,6 +95,24 @@ impl Applied {
     }
 }
 
+impl Applied {
+    /// A line for people.
+    pub fn text(&self) -> String {
+        let Trusted {
+            count,
+            precision,
+            recall,
+            ..
+        } = self.trusted;
+        format!(
+            "{count} answers trusted, precision {:.1}%, recall {:.1}%, ECE {:.3}",
+            percent(precision),
+            percent(recall),
+            self.expected_calibration_error
+        )
+    }
+}
+
 /// The curve that the program carries for this model, for re-ranked answers or for the others.
 pub fn shipped_curve(model: &ModelId, rerank: Option<&RerankId>) -> Option<ConfidenceCurve> {
     let shipped = built_in_calibration(model)?;
@@ -103,7 +129,8 @@ pub struct Fitted {
     pub in_sample_errors: [f64; 2],
     /// What the two thresholds are worth on places that had no say in them.
     pub checks: [ThresholdCheck; 2],
-    /// S at which trust begins at the median distance of right answers, if S decides at all.
+    /// S at which trust begins at the median distance of right answers, if candidates are ordered
+    /// by S and it decides at all.
     pub spatial_score: Option<f64>,
     /// What the model's own curves come to on the same answers, if there are any.
     pub shipped: [Option<Applied>; 2],
@@ -115,27 +142,64 @@ pub struct Purpose {
     /// The model.
     pub model: ModelId,
     /// The re-ranking.
-    pub rerank: RerankId,
+    pub rerank: RerankConfig,
     /// Name of the data.
     pub data: String,
     /// Share of right answers that the threshold is chosen for.
     pub target_precision: f64,
     /// Seed of the cross-validation.
     pub seed: u64,
+    /// Greatest distance of a positive in metres.
+    pub radius_m: f64,
 }
 
-/// Fits both curves.
+/// Fits everything that answers to `dataset` are ranked and trusted by: the score, if it is a
+/// learned one, and both curves. The answers are ordered by S.
+///
+/// The curve of a learned score is fitted to what that score is worth on places that it has not
+/// seen.
 ///
 /// # Errors
 /// All answers are right, or all are wrong; or the target is out of range.
-pub fn calibrate(answers: &BestAnswers, purpose: Purpose) -> Result<Fitted, EvalError> {
+pub fn fit(
+    dataset: &Dataset,
+    mut asked: DatasetAnswers,
+    purpose: Purpose,
+) -> Result<Fitted, EvalError> {
+    let RerankConfig { score, scales, .. } = &purpose.rerank;
+    let mut learned = None;
+    match score {
+        ScoreKind::Paper => {}
+        ScoreKind::Fused => asked.order_by(&Ranking::Fused),
+        ScoreKind::Learned => {
+            let lessons = Lessons::of(dataset, &asked, scales, purpose.radius_m);
+            order_unseen(dataset, &mut asked, &lessons, purpose.seed)?;
+            learned = Some(lessons.learn(|_| true)?);
+        }
+    }
+    let best = BestAnswers::of(dataset, &asked.answers, &asked.left_out, *score);
+    calibrate(&best, purpose, learned)
+}
+
+/// Fits both curves. Where the re-ranking is by a learned score, the answers have been ordered by
+/// scores that had not seen their places, and later ones will be by `learned_score`.
+///
+/// # Errors
+/// All answers are right, or all are wrong; or the target is out of range.
+fn calibrate(
+    answers: &BestAnswers,
+    purpose: Purpose,
+    learned_score: Option<LearnedScore>,
+) -> Result<Fitted, EvalError> {
     let Purpose {
         model,
         rerank,
         data,
         target_precision,
         seed,
+        radius_m: _,
     } = purpose;
+    let rerank = rerank.id();
     let one =
         |answers: &[TopOne]| measure::fit_curve(answers, target_precision, seed).map_err(unfit);
     let reranked = one(&answers.reranked)?;
@@ -144,7 +208,10 @@ pub fn calibrate(answers: &BestAnswers, purpose: Purpose) -> Result<Fitted, Eval
         shipped_curve(&model, Some(&rerank)).map(|curve| Applied::of(&curve, &answers.reranked)),
         shipped_curve(&model, None).map(|curve| Applied::of(&curve, &answers.global)),
     ];
-    let spatial_score = score_at_threshold(&reranked.curve, &answers.reranked);
+    let spatial_score = match rerank.score() {
+        ScoreKind::Paper => score_at_threshold(&reranked.curve, &answers.reranked),
+        ScoreKind::Fused | ScoreKind::Learned => None,
+    };
     let in_sample_errors = [reranked.in_sample_error, global.in_sample_error];
     let checks = [reranked.check, global.check];
     let calibration = Calibration::new(
@@ -154,6 +221,10 @@ pub fn calibrate(answers: &BestAnswers, purpose: Purpose) -> Result<Fitted, Eval
         target_precision,
         [reranked.curve, global.curve],
     )
+    .and_then(|calibration| match learned_score {
+        Some(score) => calibration.with_score(score),
+        None => Ok(calibration),
+    })
     .map_err(|error| EvalError::Setting(error.to_string()))?;
     Ok(Fitted {
         calibration,
@@ -183,6 +254,23 @@ fn score_at_threshold(curve: &ConfidenceCurve, answers: &[TopOne]) -> Option<f64
     let odds = curve.threshold / (1.0 - curve.threshold);
     let score = ((odds.ln() - weights.bias - weights.distance * median) / weights.score).exp_m1();
     (weights.score > 0.0 && score.is_finite()).then_some(score.max(0.0))
+}
+
+impl Fitted {
+    /// What candidates are ordered by.
+    ///
+    /// # Errors
+    /// The score of `rerank` is a learned one, and none was fitted.
+    pub fn ranking(&self, rerank: &RerankConfig) -> Result<Ranking<'_>, EvalError> {
+        match rerank.score {
+            ScoreKind::Paper => Ok(Ranking::Paper),
+            ScoreKind::Fused => Ok(Ranking::Fused),
+            ScoreKind::Learned => {
+                let learned = self.calibration.learned_score().map(Ranking::Learned);
+                learned.ok_or_else(|| EvalError::Setting("no score was learned".into()))
+            }
+        }
+    }
 }
 
 /// The two curves of a calibration: their names, and whether each is of re-ranked answers.

@@ -23,6 +23,16 @@ pub enum EvalError {
     /// A setting is out of range or does not go with another.
     #[error("{0}")]
     Setting(String),
+    /// A score cannot be learned from these candidates.
+    #[error(
+        "a score is learned from right and wrong candidates of other places; {right} of {total} are right"
+    )]
+    OneSided {
+        /// Right candidates.
+        right: usize,
+        /// All candidates.
+        total: usize,
+    },
     /// An image cannot be used.
     #[error(transparent)]
     Image(#[from] ImageError),

@@ -89,7 +89,7 @@ impl OwnPlaces {
         (as_they_are, left_out)
     }
 
-    fn of_query(&self, query: usize) -> &[usize] {
+    pub(super) fn of_query(&self, query: usize) -> &[usize] {
         &self.0[query]
     }
 

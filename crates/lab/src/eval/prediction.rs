@@ -121,10 +121,9 @@ mod tests {
     }
 
     fn answer(query: usize, global: &[usize], reranked: &[usize]) -> Answer {
-        let candidate = |&index: &usize| Candidate {
-            index,
-            distance: 0.0,
-            score: PairScore::default(),
+        let candidate = |&index: &usize| {
+            let distance = 0.0;
+            Candidate::by_inliers(Neighbour { index, distance }, PairScore::default())
         };
         Answer {
             query,

@@ -4,7 +4,9 @@ use super::error::EvalError;
 use super::features::Features;
 use placeformer_core::progress::Task;
 use placeformer_core::types::{GLOBAL_DIM, PackedPatches, ReferenceFilter, ReferenceId};
-use placeformer_vision::rerank::{PairScore, Ranked, RerankConfig, Reranked, Reranker};
+use placeformer_vision::rerank::{
+    Evidence, PairScore, Ranked, Ranking, RerankConfig, Reranked, Reranker,
+};
 use placeformer_vision::search::{IndexEntry, MapIndex};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -29,6 +31,20 @@ pub struct Candidate {
     pub distance: f32,
     /// What the key patches say.
     pub score: PairScore,
+    /// What the candidates are ordered by; S until [`Answer::order_by`] says otherwise.
+    pub value: f64,
+}
+
+impl Candidate {
+    /// A candidate to be ordered by S.
+    pub fn by_inliers(neighbour: Neighbour, score: PairScore) -> Self {
+        Self {
+            index: neighbour.index,
+            distance: neighbour.distance,
+            value: f64::from(score.spatial_score),
+            score,
+        }
+    }
 }
 
 /// The answer to one query.
@@ -38,7 +54,7 @@ pub struct Answer {
     pub query: usize,
     /// By global distance, nearest first.
     pub global: Vec<Neighbour>,
-    /// By S; empty if nothing was re-ranked.
+    /// By their value; empty if nothing was re-ranked.
     pub reranked: Vec<Candidate>,
 }
 
@@ -51,7 +67,22 @@ impl Answer {
             .collect()
     }
 
-    /// Database indices by S.
+    /// Orders the re-ranked candidates anew; equal ones by distance.
+    pub fn order_by(&mut self, ranking: &Ranking<'_>) {
+        let mut candidates = std::mem::take(&mut self.reranked);
+        candidates.sort_by(|a, b| {
+            let by_distance = a.distance.total_cmp(&b.distance);
+            by_distance.then(a.index.cmp(&b.index))
+        });
+        let ordered = ranking.order(candidates, |candidate| Evidence {
+            score: &candidate.score,
+            distance: candidate.distance,
+        });
+        let with_value = |(value, candidate)| Candidate { value, ..candidate };
+        self.reranked = ordered.into_iter().map(with_value).collect();
+    }
+
+    /// Database indices in the order of re-ranking.
     pub fn reranked_ranking(&self) -> Vec<usize> {
         self.reranked
             .iter()
@@ -126,14 +157,7 @@ pub fn rerank_all(
 
         answer.reranked = ranked
             .into_iter()
-            .map(|ranked| {
-                let Neighbour { index, distance } = answer.global[ranked.candidate];
-                Candidate {
-                    index,
-                    distance,
-                    score: ranked.score,
-                }
-            })
+            .map(|ranked| Candidate::by_inliers(answer.global[ranked.candidate], ranked.score))
             .collect();
         task.add(1);
     }

@@ -38,7 +38,8 @@ pub fn summarise(
     let all: Vec<&Answer> = answers.iter().collect();
     let judged = view.of_known_truth(&all);
     let with_match = view.with_match(&all);
-    let best = BestAnswers::of(dataset, answers, left_out);
+    let score = config.rerank.as_ref().map(|rerank| rerank.score);
+    let best = BestAnswers::of(dataset, answers, left_out, score.unwrap_or_default());
     let bytes = bytes_of(database);
     Summary {
         dataset: dataset.name.clone(),
@@ -193,10 +194,7 @@ impl<'a> View<'a> {
                     .global
                     .first()
                     .map(|n| (n.index, -f64::from(n.distance)))?,
-                RankedBy::Score => answer
-                    .reranked
-                    .first()
-                    .map(|c| (c.index, f64::from(c.score.spatial_score)))?,
+                RankedBy::Score => answer.reranked.first().map(|c| (c.index, c.value))?,
             };
             Some(Judged {
                 score,

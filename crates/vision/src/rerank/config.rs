@@ -1,6 +1,6 @@
 //! Settings of re-ranking.
 
-use placeformer_core::types::{InvalidValue, RerankId, ScaleSet};
+use placeformer_core::types::{InvalidValue, RerankId, ScaleSet, ScoreKind};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -22,6 +22,11 @@ pub struct RerankConfig {
     /// The search for a homography stops early once the best one has been seen with this
     /// probability.
     pub confidence: f64,
+    /// What candidates are ordered by: paper, the number of inliers S; fused, ln(S + 10) + 2 c
+    /// with the cosine c of the global descriptors; or learned, the score in the calibration of
+    /// the map or the model. Calibrations hold for one of them only.
+    #[schema(value_type = String)]
+    pub score: ScoreKind,
 }
 
 /// With more than this, one candidate takes seconds.
@@ -34,6 +39,7 @@ impl Default for RerankConfig {
             tolerance_patches: 1.5,
             max_iterations: 2000,
             confidence: 0.995,
+            score: ScoreKind::Paper,
         }
     }
 }
@@ -78,13 +84,15 @@ impl RerankConfig {
         Ok(())
     }
 
-    /// Everything that S depends on besides the descriptors: `1,1+2,2+3:t1.5:i2000:c0.995`.
+    /// Everything that the order depends on besides the descriptors:
+    /// `1,1+2,2+3:t1.5:i2000:c0.995`, and the score, if it is not S.
     pub fn id(&self) -> RerankId {
         let scales: Vec<String> = self.scales.iter().map(ToString::to_string).collect();
         let scales = scales.join(",");
         let tolerance = self.tolerance_patches;
         let iterations = self.max_iterations;
         let confidence = self.confidence;
-        RerankId::new(format!("{scales}:t{tolerance}:i{iterations}:c{confidence}"))
+        let settings = format!("{scales}:t{tolerance}:i{iterations}:c{confidence}");
+        RerankId::with_score(settings, self.score)
     }
 }

@@ -11,16 +11,20 @@
 //! | `ransac`, `frame`, `proper_samples`, `refine` | 7: the homography that most pairs agree with |
 //! | `view` | which homographies a camera can cause |
 //! | `score` | 8: inliers added up over the configured combinations of scales |
+//! | `features` | what else is learned about a pair |
 //! | `reranker` | all candidates of a query, in parallel |
+//! | `ranking` | what candidates are ordered by |
 //! | `config`, `outcome` | what goes in, and what comes out |
 //!
 //! Each thread keeps its working memory, so scoring a candidate allocates only its answer.
 
 mod config;
+mod features;
 mod frame;
 mod mutual_nn;
 mod outcome;
 mod proper_samples;
+mod ranking;
 mod ransac;
 mod refine;
 mod reranker;
@@ -31,6 +35,8 @@ mod view;
 
 pub use config::RerankConfig;
 pub use outcome::{
-    CombinationMatch, CombinationScore, Correspondence, PairScore, Ranked, Reranked,
+    CombinationFeatures, CombinationMatch, CombinationScore, Correspondence, HomographyFeatures,
+    PairFeatures, PairScore, Ranked, Reranked,
 };
+pub use ranking::{Evidence, Ranking, feature_names, feature_vectors};
 pub use reranker::Reranker;

@@ -20,6 +20,8 @@ pub(super) type Pair = (u32, u32);
 pub(super) struct PreparedQuery {
     columns: PackedColumns,
     counts: [usize; SCALES],
+    /// Value of one code unit of each descriptor.
+    factors: Vec<f32>,
     /// Centres of the patches in pixels of the model's input.
     pub(super) centres: Vec<[f32; 2]>,
 }
@@ -29,6 +31,7 @@ impl PreparedQuery {
         Self {
             columns: PackedColumns::new(simd),
             counts: [0; SCALES],
+            factors: Vec::new(),
             centres: Vec::new(),
         }
     }
@@ -41,6 +44,7 @@ impl PreparedQuery {
     pub(super) fn prepare(&mut self, query: &PackedPatches) {
         self.columns.pack(quantised(query));
         self.counts = query.counts;
+        self.factors.clone_from(&query.factor);
         centres_of(query, &mut self.centres);
     }
 }
@@ -115,6 +119,16 @@ impl Matcher {
                 }
             }
         }
+    }
+}
+
+impl Matcher {
+    /// The cosine of the descriptors of a pair that [`Self::mutual_pairs`] found for `scales`.
+    pub(super) fn cosine(&self, query: &PreparedQuery, scales: ScaleSet, pair: Pair) -> f32 {
+        let row = pair.0 as usize;
+        // The maxima leave out the factor that all partners of a descriptor have in common: its
+        // own.
+        best_over(&self.maxima.columns, scales, row).value * query.factors[row]
     }
 }
 

@@ -14,12 +14,52 @@ pub struct CombinationScore {
 }
 
 /// The score of one candidate.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct PairScore {
     /// S, the sum of the inliers of all combinations (paper III-E).
     pub spatial_score: u32,
     /// In the order of the configuration.
     pub combinations: Vec<CombinationScore>,
+    /// What else is known of the pair.
+    pub features: PairFeatures,
+}
+
+/// What matching and verification learn about a pair of images beside the counts. Computed anyway,
+/// it tells places from chance where counts alone do not.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PairFeatures {
+    /// One for each combination, in the order of the configuration; none where only the counts are
+    /// known.
+    pub combinations: Vec<CombinationFeatures>,
+}
+
+/// What is known of one combination of scales beside its counts.
+///
+/// The values do not depend on the order of patches, and are the same on every machine.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct CombinationFeatures {
+    /// Mean cosine of the descriptors of all mutual pairs; 0 if there are none.
+    pub match_cosine: f64,
+    /// The homography and its inliers, if there is one.
+    pub homography: Option<HomographyFeatures>,
+}
+
+/// What is known of a homography beside the number of its inliers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HomographyFeatures {
+    /// Mean cosine of the descriptors of the inliers.
+    pub inlier_cosine: f64,
+    /// Its standard deviation.
+    pub inlier_cosine_deviation: f64,
+    /// How much larger the reference shows the plane: the root of the determinant of the
+    /// derivative where the inliers are.
+    pub scale: f64,
+    /// How much more one direction is stretched than the other, from 1: the ratio of the singular
+    /// values of that derivative.
+    pub stretch: f64,
+    /// Deviation of the inliers from their best line, in base patches, in the image where it is
+    /// smaller.
+    pub spread: f64,
 }
 
 /// A pair of key patches that are each other's nearest.

@@ -2,8 +2,12 @@
 //! combination of scales.
 
 use super::config::RerankConfig;
+use super::features::CosineSums;
 use super::mutual_nn::{Matcher, Pair, PreparedQuery, centres_of};
-use super::outcome::{CombinationMatch, CombinationScore, Correspondence, PairScore};
+use super::outcome::{
+    CombinationFeatures, CombinationMatch, CombinationScore, Correspondence, HomographyFeatures,
+    PairFeatures, PairScore,
+};
 use super::ransac::{Estimate, Ransac, RansacSettings, is_inlier};
 use placeformer_core::types::{PackedPatches, ScaleSet};
 use placeformer_kernels::Simd;
@@ -63,15 +67,53 @@ impl Workspace {
     ) -> PairScore {
         self.compare(config, query, reference);
         let mut combinations = Vec::with_capacity(config.scales.len());
+        let mut features = Vec::with_capacity(config.scales.len());
         let mut spatial_score = 0;
         for &scales in &config.scales {
-            let (score, _) = self.verify(simd, config, query, reference, scales);
+            let (score, estimate) = self.verify(simd, config, query, reference, scales);
             spatial_score += score.inliers;
             combinations.push(score);
+            features.push(self.features(config, query, reference, scales, estimate));
         }
         PairScore {
             spatial_score,
             combinations,
+            features: PairFeatures {
+                combinations: features,
+            },
+        }
+    }
+
+    /// What is known of the combination that was just verified, beside the counts.
+    fn features(
+        &self,
+        config: &RerankConfig,
+        query: &PreparedQuery,
+        reference: &PackedPatches,
+        scales: ScaleSet,
+        estimate: Option<Estimate>,
+    ) -> CombinationFeatures {
+        let tolerance_px = tolerance_px(config, reference);
+        let mut matches = CosineSums::default();
+        let mut inliers = CosineSums::default();
+        for &pair in &self.pairs {
+            let cosine = self.matcher.cosine(query, scales, pair);
+            matches.add(cosine);
+            let points = points_of(&query.centres, &self.centres, pair);
+            if estimate.is_some_and(|found| is_inlier(&found.homography, points, tolerance_px)) {
+                inliers.add(cosine);
+            }
+        }
+        let patch_px = f64::from(reference.grid.patch_px);
+        CombinationFeatures {
+            match_cosine: matches.mean(),
+            homography: estimate.map(|found| HomographyFeatures {
+                inlier_cosine: inliers.mean(),
+                inlier_cosine_deviation: inliers.deviation(),
+                scale: found.view.scale,
+                stretch: found.view.stretch,
+                spread: found.view.spread[0].min(found.view.spread[1]) / patch_px,
+            }),
         }
     }
 

@@ -12,7 +12,9 @@ use crate::eval::run::{Answer, Candidate, Neighbour};
 use nalgebra::DMatrix;
 use placeformer_core::progress::Task;
 use placeformer_core::types::{KeyPatches, SCALES, ScaleSet};
-use placeformer_vision::rerank::{CombinationScore, PairScore, RerankConfig, Reranker};
+use placeformer_vision::rerank::{
+    CombinationScore, PairFeatures, PairScore, RerankConfig, Reranker,
+};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
@@ -91,11 +93,7 @@ fn rerank(
     let rows = query.descriptors.transpose();
     let score = |neighbour: &Neighbour| {
         let score = query.score(&rows, &database[&neighbour.index], reranker);
-        Candidate {
-            index: neighbour.index,
-            distance: neighbour.distance,
-            score,
-        }
+        Candidate::by_inliers(*neighbour, score)
     };
     let mut reranked: Vec<Candidate> = answer.global.par_iter().map(score).collect();
     // Stable: ties stay in the global order, as in the service.
@@ -176,6 +174,8 @@ impl Whole {
         PairScore {
             spatial_score: combinations.iter().map(|c| c.inliers).sum(),
             combinations,
+            // Only the counts: these answers are ordered by S.
+            features: PairFeatures::default(),
         }
     }
 }
@@ -266,7 +266,8 @@ mod tests {
         let b = Whole::of(&reference);
         let full = a.score(&a.descriptors.transpose(), &b, &reranker);
         let packed = reranker.score(&pack(&query), &pack(&reference));
-        assert_eq!(full, packed);
+        assert_eq!(full.combinations, packed.combinations);
+        assert_eq!(full.spatial_score, packed.spatial_score);
         assert!(full.combinations[0].inliers >= 45, "{full:?}");
     }
 

@@ -86,10 +86,12 @@ fn each_axis_has_its_base_row_and_extractions_are_shared() {
         backbones: &[Preset::Dinov2Vits14],
         cache: Path::new("."),
         memory_bytes: 0,
+        radius_m: 25.0,
     };
     let variants = variants(&base).unwrap();
     for axis in [
         "scales",
+        "score",
         "codec",
         "tau",
         "caps",
@@ -301,6 +303,7 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
         backbones,
         cache: &cache,
         memory_bytes: 1 << 20,
+        radius_m: 25.0,
     };
     let totals = Totals::default();
     let Ablation { rows, left_out } = ablate(&dataset, &base, &open, &totals).unwrap();
@@ -402,7 +405,7 @@ fn a_cut_from_one_extraction_is_what_a_separate_one_gives() {
         .iter()
         .filter(|row| row.setting.ends_with('*'))
         .collect();
-    assert_eq!(starred.len(), 7);
+    assert_eq!(starred.len(), 8);
     assert!(starred.iter().all(|row| row.recall == starred[0].recall && row.patch_bytes == starred[0].patch_bytes));
 }
 
@@ -429,6 +432,7 @@ fn a_base_that_is_no_row_of_its_axis_gets_one() {
         backbones: &[Preset::Dinov2Vits14],
         cache: Path::new("."),
         memory_bytes: 0,
+        radius_m: 25.0,
     };
     let stars: Vec<String> = variants(&base)
         .unwrap()
@@ -440,6 +444,7 @@ fn a_base_that_is_no_row_of_its_axis_gets_one() {
         stars,
         [
             "1+3, 2 *",
+            "paper *",
             "int8 *",
             "0.75 *",
             "9 / 8 / 7 *",

@@ -2,7 +2,7 @@
 
 use super::cuts::{Codec, Cut};
 use crate::eval::error::EvalError;
-use placeformer_core::types::{ImageSize, InvalidValue, SCALES, ScaleSet};
+use placeformer_core::types::{ImageSize, InvalidValue, SCALES, ScaleSet, ScoreKind};
 use placeformer_vision::extract::{ExtractConfig, HeadChoice, Preset};
 use placeformer_vision::rerank::RerankConfig;
 use std::path::Path;
@@ -22,6 +22,8 @@ pub struct Base<'a> {
     pub cache: &'a Path,
     /// Bytes of key patches held in memory.
     pub memory_bytes: u64,
+    /// Greatest distance of a positive in metres.
+    pub radius_m: f64,
 }
 
 /// One setting of one axis.
@@ -88,6 +90,7 @@ fn all_axes(base: &Base<'_>) -> Result<Vec<Variant>, InvalidValue> {
         variants: Vec::new(),
     };
     list.add_scales()?;
+    list.add_scores();
     list.add_codecs();
     list.add_taus_and_caps();
     list.add_input_sizes();
@@ -140,6 +143,23 @@ impl VariantList<'_> {
             });
         }
         Ok(())
+    }
+
+    fn add_scores(&mut self) {
+        for score in ScoreKind::ALL {
+            let rerank = RerankConfig {
+                score,
+                ..self.rerank.clone()
+            };
+            let is_base = score == self.rerank.score;
+            self.variants.push(Variant {
+                axis: "score",
+                setting: starred(score.as_str().to_owned(), is_base),
+                extract: self.extract.clone(),
+                rerank,
+                cut: Cut::None,
+            });
+        }
     }
 
     fn add_codecs(&mut self) {

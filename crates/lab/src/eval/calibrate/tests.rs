@@ -28,13 +28,12 @@ fn answer(query: usize, references: usize) -> Answer {
             distance: index as f32 / 10.0,
         })
         .collect();
-    let candidate = |one: &Neighbour| Candidate {
-        index: one.index,
-        distance: one.distance,
-        score: PairScore {
+    let candidate = |one: &Neighbour| {
+        let score = PairScore {
             spatial_score: 10 * one.index as u32,
-            combinations: Vec::new(),
-        },
+            ..Default::default()
+        };
+        Candidate::by_inliers(*one, score)
     };
     let reranked = global.iter().rev().map(candidate).collect();
     Answer {
@@ -94,8 +93,8 @@ fn a_widened_answer_parts_into_what_two_searches_would_have_found() {
         (vec![1, 2], vec![2, 1])
     );
     let (as_it_is, left_out) = own.part_all(&set, &[answer(0, 4)], 2);
-    let best = BestAnswers::of(&set, &as_it_is, &left_out);
-    let seen = |one: &TopOne| (one.spatial_score, one.correct, one.has_match);
+    let best = BestAnswers::of(&set, &as_it_is, &left_out, ScoreKind::Paper);
+    let seen = |one: &TopOne| (one.evidence, one.correct, one.has_match);
     assert_eq!(
         best.global.iter().map(seen).collect::<Vec<_>>(),
         [(None, true, true), (None, false, false)]
@@ -103,7 +102,10 @@ fn a_widened_answer_parts_into_what_two_searches_would_have_found() {
     let reranked: Vec<_> = best.reranked.iter().map(seen).collect();
     assert_eq!(
         reranked,
-        [(Some(10.0), false, true), (Some(20.0), false, false)]
+        [
+            (Some(11f64.ln()), false, true),
+            (Some(21f64.ln()), false, false)
+        ]
     );
 }
 
@@ -113,10 +115,11 @@ fn both_curves_are_fitted_and_the_table_names_them() {
         let has_match = query.is_multiple_of(2);
         let noise = query as f64 / 200.0;
         let global_distance = if has_match { 0.4 } else { 0.8 } + noise;
-        let spatial_score = spatial_score.map(|score| if has_match { 80.0 + score } else { score });
+        let bonus = if has_match { 80.0 } else { 0.0 };
+        let evidence = spatial_score.map(|score| (bonus + score).ln_1p());
         TopOne {
             place: query,
-            spatial_score,
+            evidence,
             global_distance,
             correct: has_match && query != 4,
             has_match,
@@ -130,12 +133,13 @@ fn both_curves_are_fitted_and_the_table_names_them() {
     };
     let purpose = Purpose {
         model: ModelId::new("m"),
-        rerank: RerankId::new("r"),
+        rerank: RerankConfig::default(),
         data: "made up".into(),
         target_precision: 0.9,
         seed: 1,
+        radius_m: 25.0,
     };
-    let fitted = calibrate(&answers, purpose.clone()).unwrap();
+    let fitted = calibrate(&answers, purpose.clone(), None).unwrap();
     let curve = fitted.calibration.curve(true);
     assert_eq!(
         (curve.right, curve.wrong, curve.without_match),
@@ -143,8 +147,8 @@ fn both_curves_are_fitted_and_the_table_names_them() {
     );
     assert!(curve.precision >= 0.85 && curve.recall > 0.8, "{curve:?}");
     assert!(
-        curve.weights.confidence(Some(100.0), 0.5) > 0.8
-            && curve.weights.confidence(Some(5.0), 0.9) < 0.2
+        curve.weights.confidence(Some(100.0f64.ln_1p()), 0.5) > 0.8
+            && curve.weights.confidence(Some(5.0f64.ln_1p()), 0.9) < 0.2
     );
     assert_eq!(fitted.shipped, [None, None]);
     let text = fitted.text();
@@ -166,7 +170,7 @@ fn both_curves_are_fitted_and_the_table_names_them() {
         ..answers
     };
     assert!(
-        calibrate(&only_right, purpose)
+        calibrate(&only_right, purpose, None)
             .unwrap_err()
             .to_string()
             .contains("--leave-out")

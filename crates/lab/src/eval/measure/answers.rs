@@ -6,8 +6,9 @@ pub struct TopOne {
     /// The place asked about: answers to one query (with and without its place in the database)
     /// share it, and so do queries that show the same place.
     pub place: usize,
-    /// S of the best answer; `None` if it was not re-ranked.
-    pub spatial_score: Option<f64>,
+    /// What the value of the best answer counts for (`ScoreKind::evidence`): ln(1 + S) where
+    /// candidates are ranked by S; `None` if it was not re-ranked.
+    pub evidence: Option<f64>,
     /// Its Euclidean distance.
     pub global_distance: f64,
     /// Whether it is a positive; false where no match exists.

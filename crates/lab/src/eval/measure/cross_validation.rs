@@ -24,7 +24,8 @@ pub struct Unseen {
 /// Confidence of every answer from a fit that has not seen its place; a fold whose others are
 /// one-sided is left out.
 pub fn cross_validate(answers: &[TopOne], ridge: f64, folds: usize, seed: u64) -> Vec<Unseen> {
-    let fold_of = folds_of(answers, folds, seed);
+    let labels: Vec<(usize, bool)> = answers.iter().map(|it| (it.place, it.correct)).collect();
+    let fold_of = folds_of(&labels, folds, seed);
     let with_fold = || answers.iter().copied().zip(fold_of.iter().copied());
     let mut unseen = Vec::new();
     for fold in 0..folds.max(2) {

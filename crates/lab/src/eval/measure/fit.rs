@@ -1,4 +1,5 @@
-//! Logistic regression on ln(1 + S) and the global distance.
+//! Logistic regression on the evidence of a score, ln(1 + S) for S itself, and the global
+//! distance.
 //!
 //! Fitted by Newton's method with a small ridge penalty, so that separable data do not send the
 //! weights to infinity. A slope of the wrong sign (fewer inliers making an answer surer) is an
@@ -62,8 +63,8 @@ pub fn fit(answers: &[TopOne], ridge: f64) -> Result<ConfidenceWeights, Calibrat
 /// Newton's method on the penalised likelihood; features whose `used` is 0 get weight 0.
 fn maximum_likelihood(answers: &[TopOne], ridge: f64, used: Vector3<f64>) -> Vector3<f64> {
     let features = |answer: &TopOne| {
-        let inliers = answer.spatial_score.unwrap_or(0.0).max(0.0).ln_1p();
-        Vector3::new(1.0, inliers, answer.global_distance).component_mul(&used)
+        let evidence = answer.evidence.unwrap_or(0.0);
+        Vector3::new(1.0, evidence, answer.global_distance).component_mul(&used)
     };
     let penalty = Matrix3::from_diagonal(&Vector3::new(1e-9, ridge, ridge));
     let loss = |w: &Vector3<f64>| -> f64 {
@@ -110,7 +111,7 @@ fn sigmoid(x: f64) -> f64 {
 /// What `weights` say about every answer.
 pub fn predict(weights: &ConfidenceWeights, answers: &[TopOne]) -> Vec<Prediction> {
     let one = |answer: &TopOne| Prediction {
-        confidence: weights.confidence(answer.spatial_score, answer.global_distance),
+        confidence: weights.confidence(answer.evidence, answer.global_distance),
         correct: answer.correct,
         has_match: answer.has_match,
     };

@@ -1,18 +1,18 @@
 //! Divides answers into the folds of a cross-validation, so that the answers of a place are in one
 //! fold, and folds have about as many right and wrong answers as each other.
 
-use super::answers::TopOne;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
 
-/// The fold of every answer, below `folds` (at least 2). Answers of one place share theirs; right
-/// and wrong answers are spread evenly.
-pub(super) fn folds_of(answers: &[TopOne], folds: usize, seed: u64) -> Vec<usize> {
+/// The fold of every answer, below `folds` (at least 2). Of an answer are given its place and
+/// whether it is right. Answers of one place share their fold; right and wrong answers are spread
+/// evenly.
+pub fn folds_of(answers: &[(usize, bool)], folds: usize, seed: u64) -> Vec<usize> {
     let mut counts: BTreeMap<usize, [usize; 2]> = BTreeMap::new();
-    for answer in answers {
-        counts.entry(answer.place).or_default()[usize::from(answer.correct)] += 1;
+    for &(place, correct) in answers {
+        counts.entry(place).or_default()[usize::from(correct)] += 1;
     }
     let mut places: Vec<(usize, [usize; 2])> = counts.into_iter().collect();
     places.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
@@ -31,7 +31,7 @@ pub(super) fn folds_of(answers: &[TopOne], folds: usize, seed: u64) -> Vec<usize
     }
     answers
         .iter()
-        .map(|answer| fold_of.get(&answer.place).copied().unwrap_or(0))
+        .map(|(place, _)| fold_of.get(place).copied().unwrap_or(0))
         .collect()
 }
 
@@ -45,17 +45,13 @@ mod tests {
         fn places_stay_whole_and_folds_even(
             raw in prop::collection::vec((0usize..40, any::<bool>()), 40..200), seed: u64,
         ) {
-            let answer = |&(place, correct): &(usize, bool)| {
-                TopOne { place, spatial_score: None, global_distance: 0.5, correct, has_match: true }
-            };
-            let answers: Vec<TopOne> = raw.iter().map(answer).collect();
-            let folds = folds_of(&answers, 5, seed);
-            prop_assert_eq!(&folds, &folds_of(&answers, 5, seed));
+            let folds = folds_of(&raw, 5, seed);
+            prop_assert_eq!(&folds, &folds_of(&raw, 5, seed));
             let mut counts = [0usize; 5];
-            for (a, fold) in answers.iter().zip(&folds) {
+            for (a, fold) in raw.iter().zip(&folds) {
                 counts[*fold] += 1;
-                for (b, other) in answers.iter().zip(&folds) {
-                    prop_assert!(a.place != b.place || fold == other);
+                for (b, other) in raw.iter().zip(&folds) {
+                    prop_assert!(a.0 != b.0 || fold == other);
                 }
             }
             let largest = (0..40).map(|place| raw.iter().filter(|one| one.0 == place).count()).max().unwrap();

@@ -5,10 +5,12 @@ use super::{SequenceRun, measures};
 use crate::datasets::Truth;
 use crate::eval::error::EvalError;
 use crate::eval::run::Answer;
+use placeformer_core::types::ScoreKind;
 use placeformer_track::{
     Belief, Estimate, Evidence, Expectation, MOST_PLACES, Motion, Place, Sight, Travel,
     Whereabouts, estimate,
 };
+use placeformer_vision::rerank::PairScore;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::HashMap;
@@ -59,7 +61,8 @@ impl Frame {
 #[derive(Debug, Clone, Copy)]
 struct Scored {
     index: usize,
-    spatial_score: Option<f64>,
+    /// What its S counts for in a calibration; absent where nothing was re-ranked.
+    evidence: Option<f64>,
     distance: f64,
 }
 
@@ -98,9 +101,7 @@ impl<'a> Drive<'a> {
         let scored = self.scored(query);
         let weights = &self.run.curve.weights;
         let best = scored.first();
-        let confidence = best.map_or(0.0, |best| {
-            weights.confidence(best.spatial_score, best.distance)
-        });
+        let confidence = best.map_or(0.0, |best| weights.confidence(best.evidence, best.distance));
         let ranking = scored.iter().map(|scored| scored.index).collect();
         self.frame(query, ranking, confidence)
     }
@@ -128,14 +129,14 @@ impl<'a> Drive<'a> {
         if answer.reranked.is_empty() {
             let by_distance = answer.global.iter().map(|neighbour| Scored {
                 index: neighbour.index,
-                spatial_score: None,
+                evidence: None,
                 distance: f64::from(neighbour.distance),
             });
             return by_distance.collect();
         }
         let by_score = answer.reranked.iter().map(|candidate| Scored {
             index: candidate.index,
-            spatial_score: Some(f64::from(candidate.score.spatial_score)),
+            evidence: Some(evidence(&candidate.score)),
             distance: f64::from(candidate.distance),
         });
         by_score.collect()
@@ -184,9 +185,7 @@ impl<'a> Drive<'a> {
 
         let began = Instant::now();
         let ratio = |scored: &Scored| {
-            let ratio = self
-                .evidence
-                .log_ratio(scored.spatial_score, scored.distance);
+            let ratio = self.evidence.log_ratio(scored.evidence, scored.distance);
             (scored.index, ratio)
         };
         let whereabouts = expected.weigh(scored.iter().map(ratio));
@@ -235,7 +234,7 @@ impl<'a> Drive<'a> {
             .into_iter()
             .map(|(index, distance, score)| Scored {
                 index,
-                spatial_score: score.map(|score| f64::from(score.spatial_score)),
+                evidence: score.as_ref().map(evidence),
                 distance: f64::from(distance),
             });
         Ok(scored.collect())
@@ -300,4 +299,9 @@ impl<'a> Odometry<'a> {
         };
         Motion::new(travel, None).map_err(|error| EvalError::Setting(error.to_string()))
     }
+}
+
+/// What the S of a pair counts for in a calibration.
+fn evidence(score: &PairScore) -> f64 {
+    ScoreKind::Paper.evidence(f64::from(score.spatial_score))
 }

@@ -9,13 +9,13 @@ use placeformer_vision::extract::ExtractConfig;
 use placeformer_vision::rerank::PairScore;
 
 fn answer(query: usize, global: &[usize], reranked: &[(usize, u32)]) -> Answer {
-    let candidate = |&(index, spatial_score): &(usize, u32)| Candidate {
-        index,
-        distance: 0.5,
-        score: PairScore {
+    let candidate = |&(index, spatial_score): &(usize, u32)| {
+        let score = PairScore {
             spatial_score,
-            combinations: Vec::new(),
-        },
+            ..Default::default()
+        };
+        let distance = 0.5;
+        Candidate::by_inliers(Neighbour { index, distance }, score)
     };
     Answer {
         query,

@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 fn answer(place: usize, spatial_score: f64, global_distance: f64, correct: bool) -> TopOne {
     TopOne {
         place,
-        spatial_score: Some(spatial_score),
+        evidence: Some(spatial_score.ln_1p()),
         global_distance,
         correct,
         has_match: correct,
@@ -33,7 +33,8 @@ fn drawn(truth: &ConfidenceWeights, count: usize, seed: u64) -> Vec<TopOne> {
         .map(|query| {
             let spatial_score = random.random_range(0.0..120.0);
             let distance = random.random_range(0.0..1.5);
-            let correct = random.random::<f64>() < truth.confidence(Some(spatial_score), distance);
+            let correct = random.random::<f64>()
+                < truth.confidence(Some(f64::ln_1p(spatial_score)), distance);
             answer(query, spatial_score, distance, correct)
         })
         .collect()
@@ -71,7 +72,8 @@ fn separable_answers_stay_finite_and_one_kind_is_refused() {
     ];
     let fitted = fit(&answers, 1e-2).unwrap();
     assert!(
-        fitted.confidence(Some(100.0), 0.5) > 0.9 && fitted.confidence(Some(5.0), 0.5) < 0.1,
+        fitted.confidence(Some(100.0f64.ln_1p()), 0.5) > 0.9
+            && fitted.confidence(Some(5.0f64.ln_1p()), 0.5) < 0.1,
         "{fitted:?}"
     );
     assert!(fitted.score.is_finite());
@@ -96,7 +98,7 @@ fn evidence_never_counts_against_itself() {
         .collect();
     let fitted = fit(&answers, 1e-2).unwrap();
     assert_eq!((fitted.score, fitted.distance), (0.0, 0.0), "{fitted:?}");
-    assert!((fitted.confidence(Some(10.0), 0.7) - 0.5).abs() < 1e-6);
+    assert!((fitted.confidence(Some(10.0f64.ln_1p()), 0.7) - 0.5).abs() < 1e-6);
 }
 
 #[test]
@@ -107,9 +109,7 @@ fn answers_without_a_score_are_judged_by_distance_alone() {
         distance: -4.0,
     };
     let mut answers = drawn(&truth, 4000, 8);
-    answers
-        .iter_mut()
-        .for_each(|answer| answer.spatial_score = None);
+    answers.iter_mut().for_each(|answer| answer.evidence = None);
     let fitted = fit_curve(&answers, 0.9, 1).unwrap();
     let curve = &fitted.curve;
     assert_eq!(curve.weights.score, 0.0);
