@@ -13,6 +13,5 @@ mod image_golden;
 mod image_inputs;
 mod image_limits;
 mod jpeg;
-mod mirrored;
 mod pictures;
 mod town;
