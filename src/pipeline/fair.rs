@@ -53,7 +53,7 @@ const LENT_AT_MOST: u32 = 2;
 pub(super) struct FairPermit {
     semaphore: FairSemaphore,
     /// Who lent it, and waits to have it back.
-    lender: Option<mpsc::Sender<()>>,
+    lender: Option<mpsc::SyncSender<()>>,
     lent: Cell<u32>,
 }
 
@@ -99,7 +99,7 @@ impl FairSemaphore {
         granted.expect("whoever waits is granted a permit")
     }
 
-    fn permit(&self, lender: Option<mpsc::Sender<()>>) -> FairPermit {
+    fn permit(&self, lender: Option<mpsc::SyncSender<()>>) -> FairPermit {
         FairPermit {
             semaphore: self.clone(),
             lender,
@@ -143,7 +143,7 @@ impl FairPermit {
         };
         let since = Instant::now();
         self.lent.set(self.lent.get() + 1);
-        let (give_back, given_back) = mpsc::channel();
+        let (give_back, given_back) = mpsc::sync_channel(1);
         drop(
             borrower
                 .granted

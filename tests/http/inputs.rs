@@ -429,7 +429,7 @@ async fn a_key_that_occurs_twice_is_refused_wherever_json_is_read() {
         ["application/json"]["example"];
     let calibration = calibration.to_string();
     for (once, twice) in [
-        ("\"format\":1", "\"format\":1,\"format\":1"),
+        ("\"format\":", "\"format\":1,\"format\":"),
         ("\"bias\":", "\"bias\":1,\"bias\":"),
         ("\"threshold\":", "\"threshold\":0.5,\"threshold\":"),
     ] {

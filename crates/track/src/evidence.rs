@@ -69,8 +69,9 @@ mod tests {
         let curve = curve();
         let evidence = Evidence::new(&curve);
         assert!((evidence.prior() - 0.75).abs() < 1e-12);
-        let odds = 3.0 * evidence.log_ratio(Some(30.0), 0.9).exp();
-        let confidence = curve.weights.confidence(Some(30.0), 0.9);
+        let score = Some(30.0f64.ln_1p());
+        let odds = 3.0 * evidence.log_ratio(score, 0.9).exp();
+        let confidence = curve.weights.confidence(score, 0.9);
         assert!((odds / (1.0 + odds) - confidence).abs() < 1e-9);
     }
 

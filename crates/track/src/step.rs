@@ -179,7 +179,8 @@ mod tests {
             expected.supported(&["found", "far", "unknown"]),
             ["near", "beyond"]
         );
-        let whereabouts = expected.weigh([("near", 5.0), ("unknown", 9.0)].into_iter());
+        let whereabouts =
+            expected.weigh([("near", 5.0), ("found", 1.0), ("unknown", 9.0)].into_iter());
         assert_eq!(whereabouts.likeliest(1)[0].0, "near");
         assert!(whereabouts.density("near") > whereabouts.density("found"));
         assert_eq!(whereabouts.density("unknown"), None);

@@ -239,7 +239,7 @@ mod tests {
     #[test]
     fn each_ranking_orders_by_its_own_value() {
         // The first has few inliers and is near; the second has many and is far.
-        let candidates = vec![
+        let candidates = [
             (pair(40, true), 0.5),
             (pair(60, true), 1.3),
             (pair(40, true), 0.5),

@@ -67,7 +67,8 @@ impl Circles {
         let (south, north) = self.lat;
         for (row, place) in block.places.iter().enumerate() {
             // A latitude that is not a number is in no range.
-            if !(place.lat >= south && place.lat <= north) || !is_live(row) {
+            let is_in_band = (south..=north).contains(&place.lat);
+            if !is_in_band || !is_live(row) {
                 continue;
             }
             let Some(located) = place.located(block.ids[row]) else {
