@@ -21,7 +21,7 @@ const LEAST_SPREAD: f64 = 0.5;
 
 /// Correspondences that are summed up at a time.
 const LANES: usize = 4;
-/// Quantities that are summed up: 1, x, y, u, v and the products of [`PRODUCTS`].
+/// Quantities that are summed up: 1, x, y, u, v, and the products of x and y and of u and v.
 const TERMS: usize = 11;
 
 /// Sums over the inliers of a homography.
